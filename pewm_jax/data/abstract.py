@@ -13,24 +13,24 @@ from pewm_jax.types import Camera, Clip, Frames
 
 
 def camera(*lead: int) -> Camera:
-    """Return cameras of a leading shape."""
+    """Return abstract cameras with the leading shape ``lead``."""
     return Camera(array(*lead, 4), array(*lead, 4, 4))
 
 
 def frames(*lead: int, height: int, width: int, colours: Any = np.uint8) -> Frames:
-    """Return frames of a leading shape (…, T); ``colours`` is the dtype of the colours."""
+    """Return abstract frames with a leading shape (…, T); ``colours`` is the dtype of ``rgb``."""
     return Frames(
         array(*lead, height, width, 3, dtype=colours), array(*lead, height, width), camera(*lead)
     )
 
 
 def clip(config: Config, batch: int, *, features: bool = False, actions: bool = True) -> Clip:
-    """Return a batch as the loader makes it.
+    """Return an abstract batch like those of the loader.
 
     Args:
         config: the experiment.
-        batch: clips.
-        features: whether the context's features are in it, where ``data.features`` keeps them.
+        batch: number of clips.
+        features: whether it contains the context's cached features (``data.features``).
         actions: whether actions were recorded.
     """
     size, asked = config.model.clip, config.model.batch_spec
@@ -53,5 +53,5 @@ def clip(config: Config, batch: int, *, features: bool = False, actions: bool = 
 
 
 def array(*shape: int, dtype: Any = np.float32) -> jax.ShapeDtypeStruct:
-    """Return one array of a shape."""
+    """Return an abstract array."""
     return jax.ShapeDtypeStruct(shape, dtype)

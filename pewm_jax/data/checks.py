@@ -1,9 +1,9 @@
 """Checks of a single episode: cameras, actions, depth, voxels, and whether they agree.
 
 ``find_disagreement`` checks that depth images, poses and intrinsics describe the same world. A
-surface that one frame sees, moved into another frame, may be hidden there behind something, but it
-cannot float in front of what that frame sees. Wrong intrinsics, wrong axes, inverted poses, a
-trajectory of other frames and a wrong depth scale all make points float.
+surface point seen in one frame and transformed into another may be occluded there, but it cannot
+float in front of that frame's surfaces. Wrong intrinsics, wrong axes, inverted poses, a trajectory
+of other frames and a wrong depth scale all make points float.
 
 Correct data has 0 to 2 % of floating points (generated houses, ICL-NUIM). Focal lengths that are
 wrong by 20 % give 14 % and more, a depth scale wrong by a factor of two 37 % and more, inverted
@@ -75,13 +75,13 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
     found += _check_saturation(depth_THW, where) or check_depth(depth_THW, where)
     if not found and not episode.info.get(
         "moving"
-    ):  # wrong poses or units would only be reported once more
+    ):  # wrong poses or units would only be reported again
         found += _check_geometry(episode, depth_THW, where)
     return found
 
 
 def _check_voxels(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterator[Problem]:
-    """Check that the grids decode, lie on one lattice around the camera, and match the depth."""
+    """Check that the grids decode, lie on one lattice, contain the camera, and match the depth."""
     try:
         grid, origin_T3 = episode.voxel_grid, episode.voxel_origin_T3
         if grid is None or origin_T3 is None:
@@ -119,7 +119,7 @@ def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
     valid = depth_THW[np.isfinite(depth_THW) & (depth_THW > 0)]
     bad = np.flatnonzero(~np.isfinite(depth_THW).all((1, 2)))
     if len(bad):
-        return [Problem(where, int(bad[0]), "depth", "holds values that are not finite.")]
+        return [Problem(where, int(bad[0]), "depth", "contains values that are not finite.")]
     median = float(np.median(valid)) if len(valid) else 0.0
     if len(valid) and not _plausible(median):
         frame = _first_frame(depth_THW, median < MEDIAN_DEPTH_M[0])
@@ -164,14 +164,14 @@ def _plausible(median: float) -> bool:
     return MEDIAN_DEPTH_M[0] <= median <= MEDIAN_DEPTH_M[1]
 
 
-def _wrong_unit(where: str, frame: int, whose: str, median: float) -> Problem:
+def _wrong_unit(where: str, frame: int, subject: str, median: float) -> Problem:
     small = median < MEDIAN_DEPTH_M[0]
     wrong = "metres were read as millimetres" if small else "the scale is too small"
     return Problem(
         where,
         frame,
         "depth",
-        f"the median depth of {whose} is {median:.3g} m: the unit is wrong ({wrong}?); correct "
+        f"the median depth of {subject} is {median:.3g} m: the unit is wrong ({wrong}?); correct "
         "the depth scale.",
     )
 
@@ -218,7 +218,7 @@ def _check_poses(episode: Episode, where: str) -> Iterator[Problem]:
     finite = np.isfinite(pose).all((1, 2))
     if not finite.all():
         frame = int(np.flatnonzero(~finite)[0])
-        yield Problem(where, frame, "world_from_camera", "holds NaN or infinity.")
+        yield Problem(where, frame, "world_from_camera", "contains NaN or infinity.")
         return
     rotation = pose[:, :3, :3]
     off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max((1, 2))
@@ -242,9 +242,9 @@ def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
     finite = np.isfinite(actions).all(1)
     if not finite.all():
         frame = int(np.flatnonzero(~finite)[0])
-        yield Problem(where, frame, "actions", "holds NaN or infinity.")
+        yield Problem(where, frame, "actions", "contains NaN or infinity.")
         return
-    if actions.shape[1] != PLANAR:  # the motion of another kind of control is not known
+    if actions.shape[1] != PLANAR:  # for other kinds of control the motion is unknown
         return
     metres, radians = action_errors(episode.world_from_camera, actions)
     for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:
@@ -279,7 +279,7 @@ def action_errors(
     turned[:, 0, 0] = turned[:, 1, 1] = np.cos(turn)
     turned[:, 1, 0], turned[:, 0, 1], turned[:, 2, 2] = np.sin(turn), -np.sin(turn), 1
     between = np.swapaxes(turned @ before[:, :3, :3], 1, 2) @ after[:, :3, :3]
-    # The chord is exact for small angles, where the arc cosine of the trace is not.
+    # Use the chord: the arc cosine of the trace is inaccurate for small angles.
     chord = np.linalg.norm(between - np.eye(3), axis=(1, 2)) / np.sqrt(8)
     return np.linalg.norm(after[:, :3, 3] - moved, axis=1), 2 * np.arcsin(np.minimum(chord, 1))
 
@@ -381,7 +381,7 @@ def _depth_between(
 
 
 def _pairs(pose_T44: np.ndarray) -> list[list[tuple[int, int]]]:
-    """Choose pairs over the whole episode: those that move most, both ways, or turn most."""
+    """Choose pairs over the whole episode: with the most motion (both directions) or rotation."""
     groups = []
     for stride in STRIDES:
         first = np.arange(len(pose_T44) - stride)

@@ -14,7 +14,7 @@ from pewm_jax.geometry.actions import PLANAR, compose
 from pewm_jax.types import Camera, Clip, Frames
 
 ReadFeatures: TypeAlias = Callable[[Episode, np.ndarray], np.ndarray]
-"""``read(episode, frames_S) -> features_ShwF``: features computed beforehand."""
+"""``read(episode, frames_S) -> features_ShwF``: cached features of an episode's frames."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,8 +34,8 @@ def choose(config: Config, length: int, rng: np.random.Generator, where: str = "
     """Draw a clip from an episode: its stride, its start and its context frames.
 
     Every stride of ``data.stride_min … stride_max`` that fits is equally likely, and so is every
-    start. The context has one frame from each of S − 1 equal parts of the past, among them the
-    frame just before the clip, and the clip's first frame.
+    start. The context has the clip's first frame and one frame from each of S − 1 equal parts of
+    the past, the last of which is the frame just before the clip.
 
     Args:
         config: ``clip.frames``, ``data.stride_min``, ``data.stride_max``, ``data.context``.
@@ -95,7 +95,7 @@ def cut(
     *,
     voxels: bool = True,
 ) -> Clip:
-    """Decode the frames of a clip, each once, and join its actions.
+    """Decode the frames of a clip, each once, and compose its actions.
 
     Args:
         episode: the episode.
@@ -137,7 +137,7 @@ def cut(
 
 
 def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
-    """Return the actions that lead from each frame of a clip to its next frame.
+    """Return the actions that lead from each frame of a clip to the next.
 
     Args:
         actions_TA: (episode's frames − 1, A), action k leads from frame k to frame k + 1 of the
@@ -159,13 +159,13 @@ def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
 def clip_at(
     config: Config, episode: Episode, start: int, stride: int = 1, frames: int | None = None
 ) -> Clip:
-    """Return the clip at these frames, without randomness; its context is spread evenly.
+    """Return the clip at given frames; its context is evenly spaced, without randomness.
 
     Args:
         config: ``clip.frames`` and ``data.context``.
-        episode: where it comes from.
+        episode: the episode.
         start: its first frame.
-        stride: actions between two of its frames.
+        stride: actions between two consecutive frames.
         frames: its length, by default ``clip.frames``.
 
     Raises:
@@ -175,7 +175,7 @@ def clip_at(
     chosen = start + stride * np.arange(count)
     if start < 0 or chosen[-1] >= episode.length:
         raise UserError(
-            f"episode {episode.name} has {episode.length} frames, so it holds no clip from {start} "
+            f"episode {episode.name} has {episode.length} frames, so it has no clip from {start} "
             f"to {chosen[-1]}; start earlier or collect longer episodes."
         )
     slots = config.data.context
@@ -221,6 +221,6 @@ def stack(clips: Sequence[Clip]) -> Clip:
 
 
 def _take(frames: Frames, rows: np.ndarray) -> Frames:
-    """Copy some of the frames."""
+    """Return copies of the frames ``rows``."""
     camera = Camera(frames.camera.intrinsics_4[rows], frames.camera.world_from_camera[rows])
     return Frames(frames.rgb_THWC[rows], frames.depth_THW[rows], camera)

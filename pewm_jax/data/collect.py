@@ -1,4 +1,4 @@
-"""Collect a dataset of houses or meshes with many workers; an interrupted collection is resumed.
+"""Collect a dataset of houses or meshes with parallel workers; the command is resumable.
 
 The unit of work is a shard. A shard is written under a temporary name and then renamed;
 ``dataset.json`` is written when all shards of a split exist. The files depend neither on
@@ -18,15 +18,15 @@ from pewm_jax.io.progress import Meter
 
 
 def collect(config: CollectConfig, log: Callable[[str], None] = print) -> None:
-    """Make a dataset, or its missing shards.
+    """Create a dataset, or its missing shards.
 
     Args:
         config: what to make and where.
         log: receives the lines to print.
 
     Raises:
-        UserError: a mesh has no floor to walk on, a dataset of other settings is in the way, there
-            is no renderer, a worker process died, or a cluster cannot be reached.
+        UserError: a mesh has no floor to walk on, the output folder contains a dataset with other
+            settings, there is no renderer, a worker process died, or a cluster cannot be reached.
     """
     for path in config.scene:
         if not path.is_file():

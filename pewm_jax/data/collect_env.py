@@ -35,7 +35,7 @@ from pewm_jax.data.importer import planar_actions
 from pewm_jax.io.progress import Meter
 
 SPLITS = ("train", "validation", "test")
-"""Folders written."""
+"""Names of the splits' folders."""
 TRIES = 20
 """Largest number of consecutive episodes that may be too short."""
 FORM = (
@@ -175,7 +175,7 @@ def _walk(
                 "episode has one camera."
             )
         if isinstance(act, _Persistent) and np.array_equal(frame["pose"], seen[-1]["pose"]):
-            act.forget()  # the action had no effect: the agent stands before a wall
+            act.forget()  # the action had no effect: the agent faces a wall
         seen.append(frame)
         if terminated or truncated:
             break
@@ -184,7 +184,7 @@ def _walk(
 
 
 def _call_user(config: CollectEnvConfig, what: str, function: Callable, *args: Any, **kwargs: Any):
-    """Call a user's function; turn whatever it raises into a ``UserError``."""
+    """Call a user's function; raise any exception as a ``UserError``."""
     try:
         return function(*args, **kwargs)
     except UserError:
@@ -266,7 +266,7 @@ class _Persistent:
         return self._last
 
     def forget(self) -> None:
-        """Draw a new action next."""
+        """Draw a new action at the next call."""
         self._last = None
 
 
@@ -340,7 +340,7 @@ def _module(name: str, flag: str) -> Any:
 
 
 def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) -> None:
-    """Make a dataset from an environment, or its missing shards.
+    """Create a dataset from an environment, or its missing shards.
 
     Args:
         config: what to make and where.
@@ -348,8 +348,8 @@ def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) ->
 
     Raises:
         UserError: the environment or the policy cannot be opened, the environment does not provide
-            what is needed, its episodes are too short or fail validation, or a dataset of other
-            settings is in the way.
+            the required arrays, its episodes are too short or fail validation, or the output folder
+            contains a dataset with other settings.
     """
     splits = resume.unfinished_splits(
         config.out,
@@ -369,7 +369,7 @@ def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) ->
             meter.advance(1)
 
     try:
-        # Make one episode before anything is written, so that a misfit is refused here.
+        # Make one episode before writing anything, so that an unsuitable environment fails here.
         make(env, policy, config, splits[0].folder.name, 0)
         total = sum(config.episodes(split.folder.name) for split in splits)
         with Meter(f"collecting {config.out}", total, "episodes") as meter:

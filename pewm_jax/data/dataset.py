@@ -27,7 +27,7 @@ from pewm_jax.io import atomic
 
 MANIFEST = "dataset.json"
 UNFINISHED = "collecting.json"
-"""File in a split folder while the split is being made; holds its settings."""
+"""File in an unfinished split folder, with the split's settings."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,12 +65,12 @@ class Manifest:
 
     @property
     def records(self) -> int:
-        """Number of episodes."""
+        """Return the number of episodes."""
         return sum(shard.records for shard in self.shards)
 
 
 def write_shard(path: Path, records: Iterable[bytes]) -> int:
-    """Write records to an ArrayRecord file, under a temporary name that is then replaced.
+    """Write records to an ArrayRecord file atomically.
 
     Returns:
         The number of records written.
@@ -99,7 +99,7 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
 
 @contextlib.contextmanager
 def _refused_writes(path: Path) -> Iterator[None]:
-    """Turn ArrayRecord's write errors into one sentence."""
+    """Raise ArrayRecord's write errors as a ``UserError``."""
     try:
         yield
     except RuntimeError as error:
@@ -112,7 +112,7 @@ def _refused_writes(path: Path) -> Iterator[None]:
 
 
 def describe_shard(path: Path) -> Shard:
-    """Count, measure and hash a shard."""
+    """Return a shard's number of records, size and hash."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return Shard(path.name, count_records(path), path.stat().st_size, digest)
@@ -185,7 +185,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def read_manifest(folder: Path, check_files: bool = True) -> Manifest:
-    """Read ``dataset.json`` and compare the shards' sizes with it (hashes: ``validate``).
+    """Read ``dataset.json`` and check the shards' sizes (``validate`` also checks hashes).
 
     Raises:
         UserError: the folder does not exist, the split is unfinished, or a shard is missing or
@@ -200,7 +200,7 @@ def read_manifest(folder: Path, check_files: bool = True) -> Manifest:
     if not path.is_file():
         inside = splits(folder)
         hint = (
-            f"it holds the splits {', '.join(inside)}; name one of them"
+            f"it contains the splits {', '.join(inside)}; choose one of them"
             if inside
             else "the collection did not finish, run the same command again to resume it"
         )

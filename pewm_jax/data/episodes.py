@@ -109,7 +109,7 @@ class Episode:
         return Camera(np.broadcast_to(self.intrinsics_4, (len(pose), 4)).copy(), pose)
 
     def frames(self, indices: Sequence[int] | np.ndarray | None = None) -> Frames:
-        """Decode some frames (all by default), in the order asked for.
+        """Decode some frames (all by default), in the order of ``indices``.
 
         Returns:
             NumPy frames: rgb uint8, depth float32 in metres.
@@ -234,7 +234,7 @@ def write_episode(
 
 
 def to_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Return metres as uint16 millimetres, rounded; beyond 65.534 m and not finite become 0."""
+    """Return metres as uint16 millimetres, rounded; 0 beyond 65.534 m and where not finite."""
     millimetres = np.rint(np.asarray(depth, np.float64) * MILLIMETRES)
     with np.errstate(invalid="ignore"):
         kept = (millimetres > 0) & (millimetres < SATURATED)
@@ -299,7 +299,7 @@ def decode_image(code: bytes | memoryview, flags: int) -> np.ndarray | None:
     """Decode an image with ``cv2.imdecode``; return None for bytes that are not an image."""
     try:
         return cv2.imdecode(np.frombuffer(code, np.uint8), flags)
-    except cv2.error:  # raised for no bytes at all, and for sizes that no image has
+    except cv2.error:  # raised for empty input and for impossible sizes
         return None
 
 
@@ -310,7 +310,7 @@ def _png(image: np.ndarray) -> bytes:
 
 
 def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
-    """Refuse arrays that do not fit together."""
+    """Raise UserError if the arrays' shapes or dtypes are inconsistent."""
     rgb, depth = arrays.rgb_THWC, arrays.depth_THW
     if depth.ndim != 3 or len(depth) == 0:
         raise UserError(f"episode {name}: depth has shape {depth.shape}, expected (T, H, W).")

@@ -70,7 +70,7 @@ class ImportConfig:
     """Import a recording: a folder of colour images, depth images and a trajectory.
 
     The camera must have OpenCV axes (x right, y down, z forward) and the trajectory must be
-    camera-to-world, as Open3D and TUM write them. If there is a folder voxels/ (a .npz for each
+    camera-to-world, as written by Open3D and TUM. If there is a folder voxels/ (a .npz for each
     colour image, and classes.json), its grids of class ids around the agent are imported as well.
     """
 
@@ -129,7 +129,7 @@ class ImportConfig:
 def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -> None:
     """Read, convert, check and add a recording to a dataset.
 
-    A recording with problems is refused before anything is written.
+    If the recording has problems, nothing is written.
 
     Args:
         config: what to read and how.
@@ -140,7 +140,7 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
     """
     name = config.name or config.src.resolve().name
     folder = config.out / config.split
-    imported = _others(config, folder, name)
+    imported = _other_shards(config, folder, name)
     frames = read_recording(config.src, config.trajectory)[:: config.stride]
     rgb, depth, source_size = _read_images(config, frames)
     width, height = depth.shape[2], depth.shape[1]
@@ -155,7 +155,7 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
         config.src, [frame.colour for frame in frames], world_from_recording(config.up)
     )
     if voxels is not None:
-        _require_like_others(folder, imported, voxels, config)
+        _require_same_grid(folder, imported, voxels, config)
     arrays = EpisodeArrays(
         rgb,
         depth,
@@ -209,7 +209,7 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     return actions if bool(((metres < ACTION_M) & (radians < ACTION_RAD)).all()) else None
 
 
-def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
+def _other_shards(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
     """Return the existing shards without the one to replace."""
     if not folder.exists():
         return []
@@ -221,7 +221,7 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
             raise UserError(
                 f"{folder} holds an unfinished collection; finish it, or give another --split."
             )
-        return [_look(path, describe_shard(path)) for path in strays if path.name != file]
+        return [_inspect(path, describe_shard(path)) for path in strays if path.name != file]
     # The shard to replace may be newer than the list, if an import was killed between the two.
     manifest = read_manifest(folder, check_files=False)
     if manifest.settings.get("made_by") != "import":
@@ -238,22 +238,22 @@ def _others(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
     return [
         _Imported(shard, frames[shard.file], actions[shard.file], voxels.get(shard.file, False))
         if shard.file in actions
-        else _look(folder / shard.file, shard)  # imported before actions were listed
+        else _inspect(folder / shard.file, shard)  # imported before actions were listed
         for shard in kept
     ]
 
 
-def _look(path: Path, shard: Shard) -> _Imported:
-    """Open a shard and return which fields it holds."""
+def _inspect(path: Path, shard: Shard) -> _Imported:
+    """Open a shard and return which fields it contains."""
     episode = read_episode(read_record(path, 0), str(path))
     acts, grid = episode.actions is not None, episode.voxel_grid
     return _Imported(shard, episode.length, acts, grid is not None)
 
 
-def _require_like_others(
+def _require_same_grid(
     folder: Path, imported: list[_Imported], voxels: VoxelFrames, config: ImportConfig
 ) -> None:
-    """Refuse voxels whose grid is not that of the split."""
+    """Raise UserError if the voxels' grid differs from that of the split."""
     for one in imported:
         if one.voxels:
             path = folder / one.shard.file
@@ -304,7 +304,7 @@ def _metres(values_HW: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _nearest(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize by nearest neighbour: interpolated depths would lie between surfaces."""
+    """Resize with nearest-neighbour sampling: interpolated depths would lie between surfaces."""
     height, width = image.shape
     rows = ((np.arange(size[1]) + 0.5) * height / size[1]).astype(int)
     columns = ((np.arange(size[0]) + 0.5) * width / size[0]).astype(int)
@@ -323,7 +323,7 @@ def _read(path: Path, flags: int) -> np.ndarray:
 
 
 def _refuse(problems: list[Problem], config: ImportConfig, frames: list[RecordedFrame]) -> None:
-    """Refuse a recording with problems; report the first with the file of its depth image."""
+    """Raise UserError for the first problem, naming the depth image's file."""
     if not problems:
         return
     first = problems[0]

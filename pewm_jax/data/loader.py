@@ -87,7 +87,7 @@ EPOCHS = 2**31
 
 
 RECORDED = ("classes_TXYZ", "origin_T3")
-"""The extras of a clip that episodes may record."""
+"""The optional arrays of a clip that episodes may contain."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -301,7 +301,7 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
 
 
 def _require_known(config: Config) -> None:
-    """Refuse a world that asks for recorded arrays which no episode has.
+    """Raise an error if a world's loss needs recorded arrays that no episode has.
 
     Raises:
         ConfigError: its ``batch_spec`` has an unknown name.
@@ -377,15 +377,15 @@ def _check_actions(config: Config, episode: Episode) -> None:
 
 
 def require_same_cells(world: World, episode: Episode) -> None:
-    """Refuse an episode whose voxel classes or pictures are not those that a world expects.
+    """Raise an error if an episode's voxel classes or images are not those that a world expects.
 
     Args:
-        world: its settings; worlds without a memory of kind ``grid`` expect nothing.
+        world: its settings; worlds without a memory of kind ``grid`` accept any.
         episode: an episode of the data. Class tables that ``collect`` did not make are not
             compared.
 
     Raises:
-        ConfigError: the episode has another table of classes, or other pictures.
+        ConfigError: the episode has another table of classes, or other images.
     """
     memory: Any = getattr(world, "memory", None)
     if not getattr(memory, "CLASSES", False) or episode.voxel_grid is None:
@@ -401,9 +401,9 @@ def require_same_cells(world: World, episode: Episode) -> None:
                     f"--voxels.colours {colours}, and memory.kinds is {memory.kinds}, memory."
                     f"colours {memory.colours}: use the same."
                 )
-    shown = episode.info.get("pictures", "surfaces")
-    if shown != memory.pictures:
+    pictures = episode.info.get("pictures", "surfaces")
+    if pictures != memory.pictures:
         raise ConfigError(
-            f"episode {episode.name} has pictures of {shown}, and memory.pictures is "
+            f"episode {episode.name} has pictures of {pictures}, and memory.pictures is "
             f"{memory.pictures}: use that, or collect with --voxels.pictures {memory.pictures}."
         )

@@ -28,8 +28,8 @@ from pewm_jax.houses.fixtures import ROBOT_HEIGHT_M
 from pewm_jax.types import Camera
 
 SPLITS = ("train", "validation", "revisit")
-"""Folders written; ``revisit`` holds the test scenes, in which the agent by default goes out and
-back (``CollectConfig.test_policy``)."""
+"""Names of the splits' folders; ``revisit`` contains the test scenes, in which the agent by default
+goes out and back (``CollectConfig.test_policy``)."""
 HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
@@ -155,7 +155,7 @@ class CollectConfig:
 
     @property
     def actions(self) -> ActionConfig:
-        """The motion of one action."""
+        """Return the motion of one action."""
         return ActionConfig(self.step_m, self.turn_deg)
 
     def episodes(self, split: str) -> int:
@@ -182,7 +182,7 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
 
 
 def house_seed(config: CollectConfig, split: str, index: int) -> int:
-    """Return the seed of an episode's house; seeds never serve two splits."""
+    """Return the seed of an episode's house; splits never share seeds."""
     number = config.seed * HOUSES_PER_SEED + index // config.episodes_per_house
     return number * len(SPLITS) + SPLITS.index(split)
 

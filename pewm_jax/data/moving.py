@@ -1,12 +1,12 @@
 """Houses with moving parts: doors that open for the agent, and robots that patrol rooms.
 
-A moving house is a generated house with parts that have poses of their own. Their poses at frame t
-are a pure function of the house and of the agent's positions up to t, so the pictures and the
-voxels of a frame show the same moment, and frame t never depends on later actions.
+A moving house is a generated house with parts that have their own poses. The poses at frame t are a
+pure function of the house and of the agent's positions up to t, so the images and the voxels of a
+frame show the same moment, and frame t never depends on later actions.
 
 * A **door** opens as the agent approaches: it is closed at ``FAR_M`` and open at ``NEAR_M`` from
   the middle of the doorway. Some doors close again behind the agent, the others stay as far open as
-  they ever were. A leaf is hung only where it has space to open and where, open, it blocks no way.
+  they ever were. A leaf is added only where it has space to open and, when open, blocks no path.
 * A **robot** follows a closed path in one room at constant speed.
 """
 
@@ -26,7 +26,8 @@ from pewm_jax.houses.shapes import Piece
 from pewm_jax.types import Camera
 
 _STREAM = 0x0D00E5
-"""Separates the random numbers of moving parts from those of the house, which is unchanged."""
+"""Seed offset that separates the random numbers of moving parts from those of the house, which is
+unchanged."""
 ROBOT_PROBABILITY = 0.6
 """Probability that a room has a robot, if it has space for a path."""
 ROBOT_STEP_M = 0.12
@@ -34,7 +35,7 @@ ROBOT_STEP_M = 0.12
 ROBOT_DISTANCE_M = 1.4
 """Distance that robots keep from doorways, where leaves swing, metres."""
 _APART_M = 20.0
-"""Distance between parts while their light is baked, so that none shades another, metres."""
+"""Distance between parts while their light is baked, so that none occludes another, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,10 +105,10 @@ def moving_house(seed: int, agent_height_m: float) -> MovingHouse:
         leaves, width, free = hang_leaves(scene, free, draw, (x0, y0, x1, y1))
         moves += leaves
         pieces += [door_leaf(draw, width)] * len(leaves)
-    opened = _placed(_parts(pieces), _opened(moves)) if moves else None
-    grid = navigable(_together(scene, opened), agent_height_m=agent_height_m)
+    opened = _placed(_parts(pieces), _open_poses(moves)) if moves else None
+    grid = navigable(_concatenate(scene, opened), agent_height_m=agent_height_m)
     for room in scene.metadata["rooms"]:
-        way = _round(grid, rng, room, scene.metadata["doorways"])
+        way = _robot_path(grid, rng, room, scene.metadata["doorways"])
         if way is not None:
             moves.append(way)
             pieces.append(robot(rng))
@@ -165,13 +166,13 @@ def render_moving(
     return seen
 
 
-def _opened(moves: list[DoorLeaf | RobotPath]) -> np.ndarray:
-    """Return the (P, 4, 4) poses of open doors."""
+def _open_poses(moves: list[DoorLeaf | RobotPath]) -> np.ndarray:
+    """Return the (P, 4, 4) poses of the parts with all doors open."""
     leaves = [move for move in moves if isinstance(move, DoorLeaf)]
     return np.concatenate([leaf.poses(leaf.middle_2[None]) for leaf in leaves])
 
 
-def _together(scene: Scene, other: Scene | None) -> Scene:
+def _concatenate(scene: Scene, other: Scene | None) -> Scene:
     """Return two scenes as one for casting rays; it must not be rendered."""
     if other is None:
         return scene
@@ -183,10 +184,10 @@ def _together(scene: Scene, other: Scene | None) -> Scene:
     )
 
 
-def _round(
+def _robot_path(
     grid: NavGrid, rng: np.random.Generator, room: list[float], doorways: list[list[float]]
 ) -> RobotPath | None:
-    """Return a robot's path in a room, through three points and back; None without a robot."""
+    """Return a robot's closed path through three points of a room, or None without a robot."""
     draw = np.random.default_rng(rng.integers(1 << 30))
     if draw.uniform() > ROBOT_PROBABILITY:
         return None
@@ -287,11 +288,11 @@ def hang_leaves(
     rng: np.random.Generator,
     rect: tuple[float, float, float, float],
 ) -> tuple[list[DoorLeaf], float, NavGrid]:
-    """Hang the leaves of a doorway.
+    """Place the door leaves of a doorway.
 
     Returns:
-        The leaves (none where they lack space to open or would block a way), their width, and the
-        cells that the agent can reach beside them.
+        The leaves (none where they lack space to open or would block a path), their width, and the
+        cells that remain reachable for the agent.
     """
     x0, y0, x1, y1 = rect
     middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
@@ -313,7 +314,7 @@ def hang_leaves(
     for k in rng.permutation(4):
         end, side = choices[k]
         leaves = [leaf(e, side) for e in ((-1, 1) if double else (end,))]
-        left = _beside(grid, leaves, width)
+        left = _clear_of(grid, leaves, width)
         if left.area >= LEAST_LEFT * grid.area and all(
             _has_room(scene, one, width) for one in leaves
         ):
@@ -321,8 +322,8 @@ def hang_leaves(
     return [], width, grid
 
 
-def _beside(grid: NavGrid, leaves: list[DoorLeaf], width: float) -> NavGrid:
-    """Return the largest free region that keeps clear of open leaves."""
+def _clear_of(grid: NavGrid, leaves: list[DoorLeaf], width: float) -> NavGrid:
+    """Return the largest free region outside the open leaves."""
     rows, columns = np.indices(grid.free_YX.shape)
     centres = grid.centre_of(np.stack([rows, columns], -1))
     free = grid.free_YX.copy()
@@ -339,7 +340,7 @@ def _beside(grid: NavGrid, leaves: list[DoorLeaf], width: float) -> NavGrid:
 
 
 def _has_room(scene: Scene, leaf: DoorLeaf, width: float) -> bool:
-    """Return whether a leaf can open without obstacles."""
+    """Return whether a leaf can open without hitting obstacles."""
     angles = leaf.yaw + leaf.swing * np.linspace(0.25, 1, 10)
     ways = np.stack([np.cos(angles), np.sin(angles), np.zeros(10)], -1)
     heights = scene.metadata.get("floor", 0.0) + np.linspace(0.05, 2.0, 14)

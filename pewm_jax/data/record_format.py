@@ -67,7 +67,7 @@ def array_shapes(frames: int) -> dict[str, tuple[int | str, ...]]:
 
 
 def shape_fits(shape: tuple[int, ...], expected: tuple[int | str, ...]) -> bool:
-    """Return whether a shape is what ``array_shapes`` says."""
+    """Return whether a shape matches an expected shape of ``array_shapes``."""
     return len(shape) == len(expected) and all(
         isinstance(wanted, str) or size == wanted
         for size, wanted in zip(shape, expected, strict=True)
@@ -127,7 +127,7 @@ def _absolute(header: dict[str, Any], payload: int) -> dict[str, Any]:
 
 
 def check_span(record: bytes, offset: int, size: int, where: str, field: str) -> None:
-    """Refuse a record that ends before a field does.
+    """Raise an error if a record ends before a field does.
 
     Raises:
         DamagedError: the record is truncated.

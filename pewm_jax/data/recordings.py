@@ -108,13 +108,13 @@ def _read_log_folder(folder: Path, trajectory: Path) -> list[RecordedFrame]:
 
 
 def natural_key(path: Path) -> tuple[tuple[tuple[int, int | str], ...], str]:
-    """Return a sort key in which numbers inside a name count as numbers: 2.png before 10.png."""
+    """Return a sort key for natural order: 2.png before 10.png."""
     parts = re.split(r"([0-9]+)", path.name)
     return tuple((0, int(p)) if p.isdecimal() else (1, p) for p in parts if p), path.name
 
 
 def _require_same_numbers(folder: Path, colours: list[Path], depths: list[Path]) -> None:
-    """Refuse numbered colour and depth images whose numbers differ.
+    """Raise UserError if numbered colour and depth images have different numbers.
 
     The first or the last number in a name may count the frames (the other can be a time stamp).
     Two series that begin with different numbers, or count in different steps, are matched by

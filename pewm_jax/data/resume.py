@@ -110,7 +110,7 @@ def unfinished_splits(
 
 
 def examine(folder: Path, settings: Mapping[str, Any], *, overwrite: bool = False) -> State:
-    """Return the state of a split, and refuse to mix settings; change nothing.
+    """Return the state of a split; raise an error if its settings differ; change nothing.
 
     Args:
         folder: the split's folder.

@@ -77,12 +77,12 @@ class Scene:
 
     @functools.cached_property
     def centre_3(self) -> np.ndarray:
-        """Middle of the bounding box; rays are cast relative to it to keep float32 exact."""
+        """Return the bounding box's middle; rays are cast relative to it for float32 accuracy."""
         return np.asarray((self.vertices_V3.min(0) + self.vertices_V3.max(0)) / 2)
 
     @functools.cached_property
     def tracer(self) -> EmbreeScene:
-        """Embree's structure over ``vertices_V3 − centre_3``; built on first use per process."""
+        """Return Embree's structure of ``vertices_V3 − centre_3``, built on first use."""
         return shading.embree(self.vertices_V3 - self.centre_3, self.faces_F3)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -101,8 +101,8 @@ def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
 
     Args:
         path: the file.
-        up: which axis of the file points up; ``auto`` takes y for glTF, as its specification
-            says, and z for all others.
+        up: which axis of the file points up; ``auto`` is y for glTF, as in its specification, and
+            z for all others.
 
     Raises:
         UserError: the file is absent or unreadable, or holds no usable triangles.
@@ -129,7 +129,7 @@ def from_trimesh(
     *,
     where: str | None = None,
 ) -> Scene:
-    """Turn a trimesh scene, with its instances, textures and colours, into a `Scene`.
+    """Convert a trimesh scene, with its instances, textures and colours, to a `Scene`.
 
     Meshes of one colour (grey if they have none) are shaded by the direction of each face. Textures
     and vertex colours are kept as they are, because scans contain their own light. A scene whose
@@ -295,7 +295,7 @@ def read_surface(mesh: trimesh.Trimesh, where: str) -> Surface:
     """Read positions, colours and image of one mesh; instances of it share the result.
 
     The colour is image × factor × vertex tint, as in glTF, but without its conversion to linear
-    light: colours are multiplied as they are stored, which reproduces the look of scans.
+    light: colours are multiplied as stored (sRGB), which reproduces the appearance of scans.
 
     Raises:
         UserError: faces point past the vertices.

@@ -71,7 +71,7 @@ def pack(images: list[np.ndarray]) -> Textures:
 
 
 def sample(textures: Textures, level_P: np.ndarray, s_P: np.ndarray, t_P: np.ndarray) -> np.ndarray:
-    """Look colours up bilinearly, repeating at the borders.
+    """Sample colours bilinearly, repeating at the borders.
 
     Args:
         textures: the scene's images.
@@ -80,7 +80,7 @@ def sample(textures: Textures, level_P: np.ndarray, s_P: np.ndarray, t_P: np.nda
         t_P: float32, 0 → 1 from the top to the bottom border.
 
     Returns:
-        (3, P) float32 in [0, 255]; channels first, as whole rows are fastest to work on.
+        (3, P) float32 in [0, 255]; channels first, because contiguous rows are faster.
     """
     width, height = textures.width_L.take(level_P), textures.height_L.take(level_P)
     x0, x1, right = _neighbours(s_P, width)
@@ -136,7 +136,7 @@ LIFT_M = 0.04
 
 
 def require_embree() -> None:
-    """Refuse to render without Embree, which has no wheels for some processors.
+    """Raise an error if Embree cannot be imported; it has no wheels for some processors.
 
     Raises:
         UserError: it cannot be imported.

@@ -1,6 +1,6 @@
 """Simulate an agent in a scene: render frames from planar poses, and move with collisions.
 
-Environments are built on it. It is stateless: ``frames`` maps poses to frames, ``move`` maps a pose
+Environments are based on it. It is stateless: ``frames`` maps poses to frames, ``move`` maps a pose
 and an action to the next pose.
 """
 
@@ -24,9 +24,9 @@ from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.types import Camera, Frames
 
 HEADROOM_M = 0.1
-"""Free space above the camera where the agent may stand, metres."""
+"""Free space above the camera that the agent needs, metres."""
 KEPT_HOUSES, KEPT_MESHES = 16, 2
-"""Scenes that a process keeps in memory, so that environments of one scene share it."""
+"""Number of scenes cached per process, so that environments of one scene share it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def open_simulator(
     world, grid = (
         _kept_house(house_seed, camera_height)
         if scene is None
-        else _kept_mesh(
+        else _cached_mesh(
             scene, scene.stat().st_mtime_ns if scene.is_file() else 0, up, camera_height
         )
     )
@@ -143,7 +143,7 @@ def move(
 
 
 def _passable(grid: NavGrid, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
-    """Return whether the straight line is free, including its end whatever the rounding."""
+    """Return whether the straight line is free, including its end, regardless of rounding."""
     return line_is_free(grid, start_xy, end_xy) and bool(is_free(grid, end_xy))
 
 
@@ -165,7 +165,7 @@ _kept_house = functools.lru_cache(maxsize=KEPT_HOUSES)(open_house)
 
 
 @functools.lru_cache(maxsize=KEPT_MESHES)
-def _kept_mesh(
+def _cached_mesh(
     path: Path, changed: int, up: Literal["auto", "y", "z"], camera_height: float
 ) -> tuple[Scene, NavGrid]:
     """Open a mesh; it is read again if it has changed on disk."""

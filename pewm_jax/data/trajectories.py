@@ -102,7 +102,7 @@ class _Agent:
         return len(self.poses) >= self.frames
 
     def record(self, action_3: np.ndarray, action_id: int = -1) -> None:
-        """Carry out an action, unless the trajectory is complete."""
+        """Apply an action, unless the trajectory is complete."""
         if not self.done:
             self.poses.append(advance(self.pose, action_3))
             self.actions.append(np.asarray(action_3, np.float64))
@@ -125,7 +125,7 @@ class _Agent:
         return self.pose[:2] + length * np.stack([np.cos(yaw), np.sin(yaw)], -1)
 
     def turn_around(self) -> None:
-        """Turn by a full circle, left or right."""
+        """Make a full turn, left or right."""
         side = TURN_LEFT if self.rng.random() < 0.5 else TURN_RIGHT
         for _ in range(round(2 * math.pi / self.turn)):
             self.act(side)

@@ -143,7 +143,7 @@ def _check_record(
         if grid is not None:
             require_alike(grids.setdefault(file.parent, grid), grid, "it")
     except DamagedError:
-        pass  # check_episode has reported it
+        pass  # reported by check_episode
     except UserError as error:
         found.append(Problem(where, None, "voxels", str(error)))
     return episode.length, found

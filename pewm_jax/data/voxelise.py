@@ -3,11 +3,11 @@
 Cells are aligned with the world: their corners are whole multiples of their side from a point of
 the lattice. Triangles are cut at the borders of cells, so every cell that a surface passes through
 is found. A cell has the class with the largest area in it; walls and floors have less weight than
-the things in front of them.
+the objects in front of them.
 
 A surface belongs to the cell just behind it (``BEHIND_M``): a floor at height 0 fills the cells
 below 0, and so does a rug on it. Only walls belong to the cell just in front of them, so that the
-two sides of one wall, in two colours, are farther apart. Solid things are hollow: a cell without a
+two sides of one wall, in two colours, are farther apart. Solid objects are hollow: a cell without a
 surface is empty.
 """
 
@@ -28,12 +28,12 @@ BEHIND_M = 0.02
 """Distance by which surfaces are moved back, and walls forward, before they are cut; at most a
 quarter of a cell."""
 SHELL_WEIGHT = 1.0 / 3
-"""Weight of an area of a wall or a floor relative to the same area of a thing in front of it."""
+"""Weight of an area of a wall or a floor relative to the same area of an object in front of it."""
 EQUAL = 1e-3
-"""Areas that differ by less than this share of a cell's face are equal, so that the smaller class
-id decides and not rounding."""
+"""Areas that differ by less than this share of a cell's face count as equal; the smaller class id
+then wins, independently of rounding."""
 NEAR = 1e-9
-"""A corner within this distance of a border does not cross it, cells."""
+"""A corner within this distance of a cell border does not cross it, cells."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """Voxel grids around the agent: their classes, their arrays and bytes, and their checks.
 
-A class is a kind of thing in one of a few named colours: the renderer of a voxel world knows only
-the class of a cell, so a wall of another colour is another class. Class 0 is empty.
+A class is a kind of object in one of a few named colours: the renderer of a voxel world knows only
+the class of a cell, so a wall of another colour has another class. Class 0 is empty.
 
 A grid is a cube of cells, aligned with the world (it does not turn with the agent). The corners of
 the grids of one episode are whole cells apart. In a record a grid is its cells, x slowest,
@@ -50,7 +50,7 @@ PALETTE = {
     "magenta": (195, 80, 165),
     "aqua": (120, 205, 210),
 }
-"""Named colours and their RGB values; the first ones distinguish most things."""
+"""Named colours and their RGB values; the first ones distinguish most objects."""
 SIDE_LIMIT = 256
 
 
@@ -66,11 +66,12 @@ class VoxelsConfig:
     side: int = 48
     """Cells of the grid along each axis; the agent's camera is in the middle."""
     kinds: Literal["all", "groups"] = "all"
-    """Kinds of things: `all` (every kind of furniture), or `groups` (all furniture is one kind)."""
+    """Kinds of objects: `all` (every kind of furniture), or `groups` (all furniture is one
+    kind)."""
     colours: int = 16
     """Colours of each kind, 1 (colours are ignored) to 24."""
     pictures: Literal["surfaces", "cells"] = "surfaces"
-    """What the images show: the `surfaces` of the house, or the recorded `cells` as blocks in the
+    """Content of the images: the `surfaces` of the house, or the recorded `cells` as blocks in the
     colours of their classes."""
 
     def __post_init__(self):
@@ -250,7 +251,7 @@ def grid_in(stream: dict[str, Any], where: str) -> VoxelGrid:
 
 
 def require_alike(first: VoxelGrid, other: VoxelGrid, where: str) -> None:
-    """Refuse grids that differ from others of the same data.
+    """Raise an error if grids differ from others of the same data.
 
     Raises:
         UserError: the cell, the side or the table of classes differs.

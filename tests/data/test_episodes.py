@@ -187,7 +187,7 @@ def test_a_disk_that_is_full_ends_in_one_sentence(tmp_path):
 
 def test_an_unfinished_split_is_not_read(tmp_path):
     folder = split(tmp_path / "train")
-    with pytest.raises(UserError, match="holds the splits train"):
+    with pytest.raises(UserError, match="contains the splits train"):
         EpisodeSource(tmp_path)
     (folder / "dataset.json").unlink()
     with pytest.raises(UserError, match="did not finish"):

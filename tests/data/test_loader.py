@@ -156,7 +156,7 @@ def test_a_certain_clip_is_always_the_same(folder):
     np.testing.assert_array_equal(
         one.frames.camera.world_from_camera, episode.world_from_camera[10:19:2]
     )
-    with pytest.raises(UserError, match="holds no clip from 20 to 28"):
+    with pytest.raises(UserError, match="has no clip from 20 to 28"):
         clipping.clip_at(config(), episode, start=20, stride=2)
 
 

@@ -194,7 +194,7 @@ def test_a_bad_record_is_found_among_good_ones(tmp_path):
     said = []
     verdict = validate(ValidateConfig(tmp_path / "train"), said.append)
     assert len(verdict.problems) == 1
-    assert said == [f"{path}, record 1, frame 4, world_from_camera: holds NaN or infinity."]
+    assert said == [f"{path}, record 1, frame 4, world_from_camera: contains NaN or infinity."]
 
 
 def test_a_file_that_was_changed_is_found_by_its_hash(tmp_path):
