@@ -1,8 +1,9 @@
-"""The clips of an evaluation: which are scored, with what context and which actions.
+"""The clips of an evaluation: which are scored, with which context and which actions.
 
-Nothing here is random. Clips start on the way back of every held-out episode, where the agent sees
-places again. Their context is thinned in the same way for every method, and the recorded motion
-drives the model. Equal ``fingerprint`` of protocol and weights means equal scores.
+The choice is deterministic. Clips start on the return path of every held-out episode, where the
+agent revisits places. Their context is subsampled in the same way for every method, and the
+recorded motion drives the model. Equal ``fingerprint`` of protocol and weights implies equal
+scores.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integ
 from pewm_jax.types import Array, Camera, Frames
 
 VERSION = 2
-"""Increase it whenever the same settings would give other scores."""
+"""Increase it whenever the same settings would give different scores."""
 POSE_TOLERANCE = 2e-3
 """Largest difference between integrated and recorded poses (metres, matrix entries)."""
 ROLLOUTS = 16
-"""The most long rollouts, one per episode."""
+"""Largest number of long rollouts, one per episode."""
 T = TypeVar("T")
 
 
@@ -37,12 +38,12 @@ class ClipChoice:
 
     Attributes:
         episode: index of the episode.
-        name: its name.
-        scene: where it was recorded.
+        name: name of the episode.
+        scene: its scene.
         start: the present frame; all earlier ones may be context.
-        context_S: (S,) frames given to ``worlds.start``, oldest first, the present last. If an
-            episode has fewer, the oldest is repeated as padding; ``load_clip`` gives padding no
-            depth, so that nothing of it is remembered twice.
+        context_S: (S,) frames passed to ``worlds.start``, oldest first, the present last. If an
+            episode has fewer, the oldest is repeated as padding; ``load_clip`` sets the depth of
+            padding to 0, so that no frame is inserted twice.
         targets_N: (N,) frames to imagine.
     """
 
@@ -61,24 +62,24 @@ def context_frames(start: int, count: int) -> tuple[int, ...]:
     return tuple(int(index) for index in padded)
 
 
-def way_back(episode: Episode) -> int:
-    """Return the frame where the way back begins: the recorded one, or else the middle."""
+def return_start(episode: Episode) -> int:
+    """Return the frame where the return path begins: the recorded one, or else the middle."""
     frame = episode.info.get("return_frame")
     return episode.length // 2 if frame is None else int(frame)
 
 
 def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) -> list[ClipChoice]:
-    """Choose the clips to imagine: starts spread evenly over every episode's way back.
+    """Choose the clips to imagine: starts spread evenly over every episode's return path.
 
     Args:
         config: gives ``clip.frames``, ``data.context`` and ``evaluate.stride``.
         episodes: held-out episodes.
-        clips: the most clips to choose; fewer if the episodes have fewer distinct starts.
-        chain: clips generated one after the other from each start.
+        clips: largest number of clips; fewer if the episodes have fewer distinct starts.
+        chain: number of consecutive clips from each start.
 
     Returns:
-        The choices: the first start of every episode, then every second start, and so on. Any
-        leading part of the list thus covers as many episodes as possible.
+        The choices: the first start of every episode, then every second start, and so on, so that
+        any prefix of the list covers as many episodes as possible.
 
     Raises:
         UserError: no episode is long enough.
@@ -93,7 +94,7 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
         last = episode.length - 1 - length
         if last < 0:
             continue
-        first = min(way_back(episode), last)
+        first = min(return_start(episode), last)
         starts = np.unique(np.round(np.linspace(first, last, per_episode)).astype(int))
         for rank, start in enumerate(starts):
             count = length // config.evaluate.stride
@@ -109,12 +110,12 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
 
 
 def choice_of(config: Config, episode: Episode, index: int, start: int, count: int) -> ClipChoice:
-    """Return the clip of an episode that begins at a frame.
+    """Return the clip of an episode that starts at a frame.
 
     Args:
         config: gives ``data.context`` and ``evaluate.stride``.
         episode: the episode.
-        index: its place among the episodes.
+        index: index of the episode.
         start: the present frame.
         count: frames to imagine.
     """
@@ -130,11 +131,11 @@ def choice_of(config: Config, episode: Episode, index: int, start: int, count: i
 
 
 def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice]:
-    """Choose one long rollout per episode, from the start of its way back.
+    """Choose one long rollout per episode, from the start of its return path.
 
     Returns:
-        At most ``ROLLOUTS`` of ``evaluate.video_clips`` clips, or of fewer if the episodes are too
-        short.
+        At most ``ROLLOUTS`` rollouts of ``evaluate.video_clips`` clips, or of fewer clips if the
+        episodes are too short.
 
     Raises:
         UserError: no episode is long enough for one clip.
@@ -149,7 +150,7 @@ def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice
 
 
 def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) -> bool:
-    """Tell whether clips must be driven by cameras, because some motion is not upright."""
+    """Return whether clips must be driven by cameras, because some motion is not planar."""
     for choice in choices:
         episode = episodes[choice.episode]
         poses = episode.world_from_camera[[choice.start, *choice.targets_N]]
@@ -168,16 +169,16 @@ def load_clip(
         config: the experiment.
         episodes: held-out episodes.
         choice: the clip.
-        cameras: whether it is driven by the recorded cameras, in six degrees of freedom, and not
-            by actions (``needs_cameras``).
+        cameras: whether it is driven by the recorded cameras, in six degrees of freedom, instead of
+            actions (``needs_cameras``).
 
     Returns:
-        ``(context, targets, control)``: S context frames, N true frames, and what leads from the
-        present through them: (N, 3) actions composed from the recorded poses, or (N,) cameras.
-        Frames that pad the context have a depth of 0 (not measured) everywhere.
+        ``(context, targets, control)``: S context frames, N ground-truth frames, and the control
+        from the present through them: (N, 3) actions composed from the recorded poses, or (N,)
+        cameras. Padding frames of the context have depth 0 (not measured) everywhere.
 
     Raises:
-        UserError: the recorded actions or the upright motion of poses do not lead to the
+        UserError: the recorded actions or the planar motion of the poses do not lead to the
             recorded poses, or the frames have another size than the model's.
     """
     episode = episodes[choice.episode]
@@ -196,25 +197,25 @@ def load_clip(
         [context.camera.world_from_camera[-1:], targets.camera.world_from_camera]
     )
     actions_N3 = np.asarray(actions_between(poses))
-    _check_motion(np.asarray(_followed(poses[0], actions_N3)), poses, choice, "upright motion")
+    _check_motion(np.asarray(_integrate(poses[0], actions_N3)), poses, choice, "planar motion")
     if episode.actions is not None and episode.actions.shape[1] == PLANAR:
         recorded = np.asarray(continuous(config.model.actions, episode.actions))
         steps = recorded[choice.start : choice.targets_N[-1]]
-        every = np.asarray(_followed(poses[0], steps))
+        every = np.asarray(_integrate(poses[0], steps))
         taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
         _check_motion(taken, poses, choice, "recorded actions")
     return context, targets, actions_N3
 
 
 def _without_padding(context: Frames, context_S: Sequence[int]) -> Frames:
-    """Return a context in which frames that are repeated have depth in the last copy alone."""
+    """Set the depth of repeated context frames to 0 in all but the last copy."""
     repeated = np.append(np.diff(context_S) == 0, False)
     depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
     return dataclasses.replace(context, depth_THW=depth)
 
 
-_followed = jax.jit(integrate)
-"""``integrate``, compiled once for each length and not for each clip."""
+_integrate = jax.jit(integrate)
+"""``integrate``, compiled once per length instead of once per clip."""
 
 
 def _check_motion(integrated: np.ndarray, poses: np.ndarray, choice: ClipChoice, what: str) -> None:
@@ -242,14 +243,14 @@ def fingerprint(
     protocol: str = "",
     baseline: str = "",
 ) -> str:
-    """Return a hash of all that scores depend on, but the choice of seeds, rivals and measures.
+    """Return a hash of all that scores depend on, except seeds, reference model and metrics.
 
     Args:
         config: the run's configuration, with overrides for the evaluation.
         weights: sha256 of the weights.
         dataset: sha256 of the data set's index.
-        lpips: sha256 of the weights of LPIPS; "" if it is left out.
-        protocol: hash of the choices in a protocol's file, except for seeds; "" if clips are chosen
+        lpips: sha256 of the weights of LPIPS; "" if it is not measured.
+        protocol: hash of the choices in a protocol file, except for seeds; "" if clips are chosen
             by the settings.
         baseline: with a protocol, sha256 of the index of the split that chooses the reprojection's
             settings; "" if there is none.

@@ -1,6 +1,6 @@
 """Reconstruction errors of a codec on held-out frames.
 
-Frames are scored at the size that they were recorded at, which need not be the one trained on.
+Frames are scored at their recorded size, which may differ from the training size.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pewm_jax.types import Array, Frames, Params
 from pewm_jax.worlds.rollouts import load_finished
 
 FRAMES = 16
-"""Frames of an episode that are scored, evenly spread over it."""
+"""Number of frames scored per episode, evenly spaced."""
 
 
 def score(
@@ -39,31 +39,31 @@ def score(
     split: str | None = None,
     log: Callable[[str], Any] = print_now,
 ) -> Path:
-    """Score a trained codec on a split and print and write the numbers.
+    """Score a trained codec on a split; print the scores and write them to a file.
 
     Args:
-        run: the folder of a finished run of the world `codec`, or the name of a codec that comes
+        run: the folder of a finished run of the world `codec`, or the name of a codec that ships
             with the library.
         data: the data set's folder; by default the run's.
         split: the folder inside it; by default the run's ``evaluate.split``.
-        log: shows a line.
+        log: prints a line.
 
     Returns:
-        The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` of a codec that
-        comes with the library). Scores are means over frames, then over
-        episodes, then over scenes; ``error`` is the standard error over scenes.
+        The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` for a codec that
+        ships with the library). Scores are means over frames, then over episodes, then over scenes;
+        ``error`` is the standard error over scenes.
 
     Raises:
-        UserError: the run, its weights or the data are absent, damaged, or do not fit together.
+        UserError: the run, its weights or the data are missing, damaged or incompatible.
     """
     home, run = shipped.home(run), shipped.find(run)
     config, params = load_finished(run)
     if not isinstance(config.model, CodecWorldConfig):
-        raise UserError(f"{run} holds a world model and no codec alone: use pewm-jax evaluate.")
+        raise UserError(f"{run} contains a world model, not a codec: use pewm-jax evaluate.")
     if not runs.is_finished(run, config):
         raise UserError(
-            f"{run} is not trained to its end: run the training's command again, which goes on "
-            "where it stopped and fits the latents' statistics last."
+            f"{run} is not fully trained: run the training command again, which resumes and then "
+            "fits the latents' statistics."
         )
     folder = Path(data or config.data.path) / (split or config.evaluate.split)
     episodes = EpisodeSource(folder)
@@ -100,18 +100,18 @@ def score(
 
 
 def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[str, Array]:
-    """Measure one episode's frames, encoded and decoded.
+    """Return reconstruction errors of one episode's frames, encoded and decoded.
 
     Args:
         model: the world.
         params: the codec's parameters.
-        frames: (T, H, W, …) of any size that the codec takes, colours uint8.
+        frames: (T, H, W, …) of any size that the codec accepts, colours uint8.
 
     Returns:
-        Of each frame (T,): ``psnr`` of colour in decibels; of measured pixels within the model's
-        range ``depth_cm``, the mean absolute error in centimetres, and ``depth_relative`` (not a
-        number where nothing was measured); ``square_rgb`` and ``square_depth``, the mean squares of
-        the normalised latents, together 1 on average where the frames are like those trained on.
+        Per frame (T,): ``psnr`` of colour in dB; over measured pixels within the model's range,
+        ``depth_cm``, the mean absolute error in cm, and ``depth_relative`` (NaN if nothing was
+        measured); ``square_rgb`` and ``square_depth``, the mean squares of the normalised latents,
+        whose mean is about 1 if the frames resemble the training data.
     """
     rgb = signal_from_rgb(frames.rgb_THWC)
     depth = jnp.asarray(frames.depth_THW)
@@ -119,10 +119,10 @@ def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[st
     grey = jnp.broadcast_to(signal_from_depth(model.clip, whole)[..., None], rgb.shape)
     both = jnp.stack([rgb, grey])
     latents = model.codec.encode(params, both)  # type: ignore[arg-type]
-    made = model.codec.decode(params, latents)  # type: ignore[arg-type]
-    squared = jnp.square(unit_colours(made[0]) - unit_colours(frames.rgb_THWC))
+    decoded = model.codec.decode(params, latents)  # type: ignore[arg-type]
+    squared = jnp.square(unit_colours(decoded[0]) - unit_colours(frames.rgb_THWC))
     inside = (depth >= model.clip.near_m) & (depth <= model.clip.far_m)
-    off = jnp.abs(depth_from_signal(model.clip, made[1].mean(-1)) - depth) * inside
+    off = jnp.abs(depth_from_signal(model.clip, decoded[1].mean(-1)) - depth) * inside
     count = inside.sum((1, 2))
     return {
         "psnr": psnr(squared.mean((1, 2, 3))),
@@ -134,7 +134,7 @@ def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[st
 
 
 def _mean_of_frames(found: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Average over the frames that have a number."""
+    """Average over the frames with a finite value."""
     means = {}
     for name, values in found.items():
         known = values[np.isfinite(values)]
@@ -143,7 +143,7 @@ def _mean_of_frames(found: Mapping[str, np.ndarray]) -> dict[str, float]:
 
 
 def _over_scenes(scenes: list[list[float]]) -> dict[str, float | None]:
-    """Average episodes, then scenes; None where there is nothing to average."""
+    """Average episodes, then scenes; None if there is nothing to average."""
     means = np.array([np.mean(scene) for scene in scenes])
     means = means[np.isfinite(means)]
     many = len(means) > 1
@@ -156,14 +156,14 @@ def _over_scenes(scenes: list[list[float]]) -> dict[str, float | None]:
 def _lines(numbers: Mapping[str, Mapping[str, float | None]]) -> list[str]:
     units = {
         "psnr": "colour, PSNR, dB",
-        "depth_cm": "depth off by, cm",
-        "depth_relative": "depth off by, share",
+        "depth_cm": "depth error, cm",
+        "depth_relative": "depth error, relative",
         "square_rgb": "latents of colour, mean square",
         "square_depth": "latents of depth, mean square",
     }
     lines = []
     for name, about in units.items():
         mean, error = numbers[name]["mean"], numbers[name]["error"]
-        shown = "nothing measured" if mean is None else f"{mean:.3f}"
-        lines.append(f"  {about:<30} {shown}" + (f" ± {error:.3f}" if error is not None else ""))
+        text = "nothing measured" if mean is None else f"{mean:.3f}"
+        lines.append(f"  {about:<30} {text}" + (f" ± {error:.3f}" if error is not None else ""))
     return lines

@@ -1,4 +1,4 @@
-"""Compare two evaluated runs: paired differences, clip by clip, under one protocol."""
+"""Compare two evaluated runs: paired differences per clip, under one protocol."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ SCHEMA = 1
 """Version of the layout of ``comparison.json``, which ``docs/evaluation.md`` describes."""
 COMPARISON = "comparison.json"
 SEED, DATA = "train.seed", "data.path"
-"""Settings in which seeds of one training may differ; in a report the path is that of the data that
-were scored, which may lie anywhere."""
+"""Settings in which seeds of one training may differ; the path in a report is that of the scored
+data, whose location does not matter."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """A report that was read from its folder.
+    """A report read from its folder.
 
     Attributes:
-        name: the run, as it was named.
-        folder: the report's.
+        name: name of the run, as passed by the caller.
+        folder: the report's folder.
         metrics: the content of ``metrics.json``.
         samples: the scores of every clip.
-        protocol: what they were scored by.
+        protocol: the protocol of the evaluation.
     """
 
     name: str
@@ -52,7 +52,7 @@ class Report:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What the comparison says of it."""
+        """Return the entry for ``comparison.json``."""
         said = self.metrics["protocol"]
         return {
             "run": self.name,
@@ -74,22 +74,22 @@ def compare(
     out: str | Path | None = None,
     log: Callable[[str], Any] = print,
 ) -> Path:
-    """Write a page and ``comparison.json`` on two runs that were scored by one protocol.
+    """Write a page and ``comparison.json`` for two runs scored by one protocol.
 
     Args:
-        one: a scored run, or the folder of one of its reports.
-        two: the same.
-        also_one: runs that differ from ``one`` in the training seed alone.
-        also_two: the same of ``two``.
-        out: the folder to write; by default ``compare-TWO`` beside the first one's report.
-        log: shows a line.
+        one: an evaluated run, or the folder of one of its reports.
+        two: likewise.
+        also_one: runs that differ from ``one`` only in the training seed.
+        also_two: likewise for ``two``.
+        out: the output folder; by default ``compare-TWO`` beside the first one's report.
+        log: prints a line.
 
     Returns:
         The path of the page.
 
     Raises:
-        UserError: a run has no report, or not of this version; the protocols differ; or runs that
-            should differ in the training seed alone do not.
+        UserError: a run has no report, or one of another version; the protocols differ; or runs
+            that should differ only in the training seed differ otherwise.
     """
     groups = [[read(name) for name in names] for names in ([one, *also_one], [two, *also_two])]
     first = groups[0][0]
@@ -115,16 +115,16 @@ def read(name: str | Path) -> Report:
     """Read a run's report.
 
     Args:
-        name: a run's folder, the name of weights that come with the library, or the folder of a
+        name: a run's folder, the name of weights that ship with the library, or the folder of a
             report itself.
 
     Raises:
-        UserError: there is none, it is of another version, or its files do not belong together.
+        UserError: there is no report, it is of another version, or its files are inconsistent.
     """
     folder = Path(name)
     if not (folder / METRICS).is_file():
         folder = shipped.home(name) / OWN
-    again = f"score it with `pewm-jax evaluate {name}`; finished scores are reused"
+    again = f"evaluate it with `pewm-jax evaluate {name}`; finished scores are reused"
     try:
         metrics = json.loads((folder / METRICS).read_text("utf-8"))
     except OSError:
@@ -133,7 +133,7 @@ def read(name: str | Path) -> Report:
         raise UserError(f"{folder / METRICS} is not JSON ({error}): {again}.") from None
     if isinstance(metrics, dict) and "protocol_sha256" not in (metrics.get("protocol") or {}):
         raise UserError(
-            f"the report in {folder} holds no protocol: it is of a codec, whose frames are not "
+            f"the report in {folder} contains no protocol: it is of a codec, which cannot be "
             f"compared, or of an earlier version of the library; in that case {again}."
         )
     if not isinstance(metrics, dict) or metrics.get("schema") != REPORT_SCHEMA:
@@ -158,13 +158,13 @@ def _require_same_protocol(one: Report, two: Report) -> None:
         raise UserError(
             f"{one.name} and {two.name} were scored by different protocols "
             f"({one.protocol.sha256[:12]} and {two.protocol.sha256[:12]}: "
-            f"{difference(one.protocol, two.protocol)}), so their clips cannot be paired; score "
-            f"one by the other's: `pewm-jax evaluate {two.name} --protocol {file}`."
+            f"{difference(one.protocol, two.protocol)}), so their clips cannot be paired; evaluate "
+            f"one with the other's: `pewm-jax evaluate {two.name} --protocol {file}`."
         )
 
 
 def _require_seeds(group: Sequence[Report]) -> None:
-    """Refuse runs that are not trainings of the same, each with a seed of its own."""
+    """Raise an error unless runs differ only in their training seeds, which must be distinct."""
     if len(group) == 1:
         return
     settings = [
@@ -176,7 +176,7 @@ def _require_seeds(group: Sequence[Report]) -> None:
         wrong = runs.differences(here, there)
         if wrong:
             raise UserError(
-                f"{report.name} and {group[0].name} are no two seeds of one training: "
+                f"{report.name} and {group[0].name} are not two seeds of one training: "
                 f"{'; '.join(wrong)}; compare them with each other instead."
             )
     seeds = [found.get(SEED) for found in settings]
@@ -191,8 +191,8 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
     """Return the content of ``comparison.json``.
 
     Args:
-        one: reports of the first model's training seeds, all by one protocol.
-        two: the same of the second.
+        one: reports of the first model's training seeds, all of one protocol.
+        two: likewise for the second model.
 
     Returns:
         See ``docs/evaluation.md``; differences are first − second.
@@ -229,7 +229,7 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
 
 
 def _facts(report: Report) -> dict[str, Any]:
-    """Return what the page says of the protocol."""
+    """Return the facts about the protocol for the page."""
     chosen = report.protocol
     return {
         "episodes": len(chosen.episodes),
@@ -246,7 +246,7 @@ def _facts(report: Report) -> dict[str, Any]:
 
 
 def _values(group: Sequence[Report], part: str, skip: set[str]) -> dict[str, dict[str, Any]]:
-    """Return ``[mask][metric]`` as (K, C, …): training seeds, clips; sampling seeds averaged."""
+    """Return ``[mask][metric]`` as (K, C, …): training seeds, clips; mean over sampling seeds."""
     tables = [report.samples.table(part, report.samples.own) for report in group]
     return {
         mask: {
@@ -259,13 +259,13 @@ def _values(group: Sequence[Report], part: str, skip: set[str]) -> dict[str, dic
 
 
 def _measured(group: Sequence[Report]) -> set[str]:
-    """Return the metrics that all runs of a side have."""
+    """Return the metrics that all runs of a group have."""
     tables = [report.samples.table("clips", report.samples.own) for report in group]
     return set.intersection(*(set(table[MASKS[-1]]) for table in tables))
 
 
 def _map(function: Callable[..., Any], *tables: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Apply a function to the entries ``[mask][metric]`` that all tables have."""
+    """Apply a function to the entries ``[mask][metric]`` present in all tables."""
     return {
         mask: {
             metric: function(*(table[mask][metric] for table in tables))
@@ -300,7 +300,7 @@ def _over_seeds(values: Mapping[str, Any], houses_C: np.ndarray) -> dict[str, An
 def _by_house(
     report: Report, averaged: Mapping[str, Any], houses_C: np.ndarray
 ) -> list[dict[str, Any]]:
-    """Return for every house its clips and the difference of PSNR under each mask."""
+    """Return, per house, its clips and the difference of PSNR under each mask."""
     names, counts = np.unique(report.samples.houses("clips"), return_counts=True)
     found = {
         mask: intervals.within_houses(averaged["differences"][mask]["psnr"], houses_C)
@@ -314,6 +314,6 @@ def _by_house(
 
 
 def _short(report: Report) -> str:
-    """Return a name for a folder: the run's, with the report's where it is not the run's own."""
+    """Return a folder name: the run's, with the report's name unless it is the default report."""
     run = report.folder.parent.resolve().name
     return run if report.folder.name == OWN else f"{run}-{report.folder.resolve().name}"

@@ -20,7 +20,7 @@ from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.types import Array, Frames, Params, WorldState
 
 NAMES = ("seen", "held", "chosen", "attended", "rendered", "looked_at")
-"""The numbers of ``World.coverage``, in the order in which they are kept."""
+"""The keys of ``World.coverage``, in the order in which they are stored."""
 
 
 def score_coverage(
@@ -31,12 +31,12 @@ def score_coverage(
     log: Callable[[str], Any] = print_now,
     choices: Sequence[ClipChoice] | None = None,
 ) -> dict[str, float] | None:
-    """Count over the first clip of every chain that is scored; stored in ``cache``.
+    """Measure coverage over the first clip of every scored chain; results are stored in ``cache``.
 
     Without ``choices`` they are those of ``choose``.
 
     Returns:
-        The shares of the pixels seen before: ``held``, ``chosen``, ``attended``, ``rendered``,
+        Shares of the pixels seen before: ``held``, ``chosen``, ``attended``, ``rendered``,
         ``looked_at`` (see ``memory.coverage.Coverage``); None if no pixel was seen before.
 
     Raises:
@@ -47,7 +47,7 @@ def score_coverage(
     starts = range(0, len(choices), config.evaluate.batch)
 
     def work(todo: list[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        log("counting what the map covers …")
+        log("measuring the coverage of the map …")
         for first in todo:
             some = choices[first : first + config.evaluate.batch]
             batch = load_batch(config, episodes, some, first, cameras=model.cameras)

@@ -1,4 +1,4 @@
-"""Evaluate a trained run: write ``report/`` with metrics.json, index.html and its pictures."""
+"""Evaluate a trained run: write ``report/`` with metrics.json, index.html and images."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ from pewm_jax.report.pictures import ROWS, save_png
 from pewm_jax.train import processes
 
 TRAINED_ON = "train"
-"""The split that training reads."""
+"""The training split."""
 REPORT_VERSION = 11
-"""Increase it whenever the same scores would give another report."""
+"""Increase it whenever the same scores would give a different report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
-"""The protocol of a report, in its folder; another run can be scored by it."""
+"""File of the protocol in a report's folder; another run can be evaluated with it."""
 
 
 def override(config: Config, **changes: Any) -> Config:
-    """Return the configuration with some of the evaluation's settings changed.
+    """Return the configuration with overrides of the evaluation's settings.
 
     Args:
         config: the run's configuration.
         changes: fields of ``EvalConfig``, ``steps`` (of the sampler) and ``data`` (folder of the
-            data set). None keeps a setting.
+            data set). None keeps the setting.
 
     Raises:
-        ConfigError: a value cannot work.
+        ConfigError: a value is invalid.
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
@@ -67,8 +67,8 @@ def override(config: Config, **changes: Any) -> Config:
     if steps is not None:
         if not config.model.sample_steps:
             raise UserError(
-                f"--steps is {steps}, and this world has no sampler whose steps could be chosen: "
-                "leave it out."
+                f"--steps is {steps}, but this world has no sampler with a number of steps: "
+                "omit it."
             )
         config = dataclasses.replace(config, model=config.model.with_sample_steps(steps))
     if data is not None:
@@ -84,27 +84,27 @@ def evaluate(
     config: Config | None = None,
     **changes: Any,
 ) -> Path:
-    """Score a trained run and write its report.
+    """Evaluate a trained run and write its report.
 
-    Several processes (``train.processes``) share the work, and several devices of one process its
-    batches; the first process writes the report.
+    Several processes (``train.processes``) share the work, and the devices of a process share its
+    batches; process 0 writes the report.
 
     After an interruption, finished scores are reused. A report that is complete for these weights
     and this protocol is not written again.
 
     Args:
         run: a run folder made by ``train.py``.
-        out: the folder to write; by default ``RUN/report``, or ``RUN/report-NAME`` for other data
-            or another split than the run's own.
-        log: shows a progress line.
-        config: the run's configuration, if it is read already.
-        changes: as for ``override``; beside a protocol's file not what it fixes.
+        out: the output folder; by default ``RUN/report``, or ``RUN/report-NAME`` for other data or
+            another split than the run's own.
+        log: prints a line.
+        config: the run's configuration, if already loaded.
+        changes: as for ``override``; with a protocol file, not the settings that it fixes.
 
     Returns:
         The path of the page.
 
     Raises:
-        UserError: the run, its weights or the data are absent, damaged, or do not fit together.
+        UserError: the run, its weights or the data are missing, damaged or incompatible.
     """
     loaded = runs.open_run(run, config)
     job = _open_job(loaded, changes)
@@ -113,7 +113,7 @@ def evaluate(
     complete = is_complete(
         folder, config, job.fingerprint, job.none_weights, job.metrics.hashes, job.validation
     )
-    processes.barrier("evaluate: decided")  # nobody writes before all have looked
+    processes.barrier("evaluate: decided")  # nobody may write before all have checked
     if complete:
         log("the report is complete for these weights and this protocol; nothing to do")
         return folder / PAGE
@@ -133,7 +133,7 @@ def evaluate(
     methods = _methods(job, choice, log, cameras=protocol.control == "cameras")
     measured = _measure(job, methods, cache, clips, rollouts, log)
     if not processes.is_primary():
-        processes.barrier("evaluate: report")  # devices that wait for one another would give up
+        processes.barrier("evaluate: report")  # a device collective would time out
         return folder / PAGE
     log("drawing the report …")
     metrics = _metrics(job, measured, protocol, choice)
@@ -148,16 +148,16 @@ def evaluate(
 
 @dataclasses.dataclass(frozen=True)
 class _Job:
-    """What is evaluated, and by which settings.
+    """The inputs and settings of an evaluation.
 
     Attributes:
         loaded: the run.
-        has_memory: whether it has a memory.
-        none: a run without a memory to compare with, or None.
-        config: the run's configuration with overrides, under the protocol's file.
-        protocol: the protocol of the file that the settings name, or None.
+        has_memory: whether the run has a memory.
+        none: the reference run without a memory, or None.
+        config: the run's configuration with overrides and the settings of the protocol file.
+        protocol: the protocol file's content, or None.
         episodes: held-out episodes.
-        metrics: the metrics that the settings ask for.
+        metrics: the selected metrics.
         validation: sha256 of the index of the split that chooses the reprojection's settings.
         data_hash: sha256 of the index of the episodes.
         fingerprint: hash of all that scores depend on.
@@ -178,20 +178,20 @@ class _Job:
 
     @property
     def split(self) -> Path:
-        """The folder of the episodes."""
+        """Return the folder of the episodes."""
         return Path(self.config.data.path) / self.config.evaluate.split
 
     @property
     def none_weights(self) -> str:
-        """The hash of the weights of ``none``; "" if there is none."""
+        """Return the hash of the weights of ``none``, or ""."""
         return self.none.weights_hash if self.none else ""
 
 
 def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
-    """Read the data, the metrics and the rival that an evaluation needs.
+    """Load the data, the metrics and the reference run of an evaluation.
 
     Raises:
-        UserError: something is absent, or does not fit the run.
+        UserError: a part is missing, or does not fit the run.
     """
     has_memory = runs.has_memory(loaded)
     config, protocol = apply_protocol_file(override(loaded.config, **changes), changes)
@@ -232,7 +232,7 @@ def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
 def _methods(
     job: _Job, choice: ReprojectChoice, log: Callable[[str], Any], *, cameras: bool
 ) -> Methods:
-    """Return who imagines."""
+    """Return the methods to evaluate."""
 
     def runner(run: runs.LoadedRun, config: Config) -> ModelRunner:
         return ModelRunner(
@@ -256,7 +256,7 @@ def _methods(
 
 @dataclasses.dataclass(frozen=True)
 class _Measured:
-    """All measurements of an evaluation.
+    """The measurements of an evaluation.
 
     Attributes:
         scored: errors of the clips.
@@ -264,7 +264,7 @@ class _Measured:
         mirror: the mirror test, or None.
         coverage: shares of the pixels that the map covers, or None.
         steered: PSNR with true, shuffled and no actions, or None.
-        about: sentences on the mirror test and on steering, for the protocol.
+        about: descriptions of the mirror test and of steering, for the protocol.
         cameras: whether cameras drive the model.
     """
 
@@ -344,7 +344,7 @@ def _write(
     scored: Scored,
     long: LongRollouts,
 ) -> None:
-    """Write all files of a report but its protocol; ``metrics.json``, which says so, at the end."""
+    """Write all files of a report except its protocol; ``metrics.json`` last, as a marker."""
     (folder / METRICS).unlink(missing_ok=True)
     names = ("protocol_sha256", "weights_sha256", "lpips_weights_sha256", "seeds")
     facts = {name: metrics["protocol"][name] for name in names}
@@ -357,7 +357,7 @@ def _write(
 
 
 def _save_pictures(folder: Path, gallery: Gallery) -> None:
-    """Write the strip, still and moving, and the frames of each long rollout and method."""
+    """Write the strip as image and animation, and the frames of each long rollout and method."""
     save_png(folder / STRIP, gallery.strip)
     (folder / MOVING).write_bytes(gallery.moving)
     atomic.remove(folder / ROWS)
@@ -367,16 +367,16 @@ def _save_pictures(folder: Path, gallery: Gallery) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder of a report.
+    """Create the folder of a report.
 
     Raises:
-        UserError: it cannot be made.
+        UserError: it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(
-            f"{folder} cannot be made ({error.strerror}); choose another folder with --out."
+            f"{folder} cannot be created ({error.strerror}); choose another folder with --out."
         ) from None
 
 
@@ -388,16 +388,17 @@ def is_complete(
     extras: Mapping[str, Any] | None = None,
     validation: str = "",
 ) -> bool:
-    """Tell whether a folder holds the complete report for a fingerprint, seeds, videos and rival.
+    """Return whether a folder contains the complete report for these weights and this protocol.
 
     Args:
-        folder: the report's.
+        folder: the report's folder.
         config: the run's configuration, with overrides for the evaluation.
         name: the fingerprint of weights and protocol.
-        none_weights: sha256 of the weights of the model without a memory; "" if there is none.
-        extras: entries of the protocol on measures that can be left out.
-        validation: sha256 of the index of the split that chooses the reprojection's settings; ""
-            if there is none. Reports of version 0.1 do not state it and are not complete: their
+        none_weights: sha256 of the weights of the reference model without a memory; "" if there is
+            none.
+        extras: protocol entries of optional metrics.
+        validation: sha256 of the index of the split that chooses the reprojection's settings; "" if
+            there is none. Reports of version 0.1 do not contain it and count as incomplete: their
             partial scores are kept, and the report is written again.
     """
     try:
@@ -420,11 +421,11 @@ def is_complete(
 
 
 def held_out(scenes: Sequence[str], trained_on: Path) -> dict[str, Any]:
-    """Tell whether the model was trained in the scenes it is scored in; compares names.
+    """Compare the names of the scored scenes with those of the training scenes.
 
     Args:
-        scenes: names of the scenes scored.
-        trained_on: folder of the split the run was trained on.
+        scenes: names of the scored scenes.
+        trained_on: folder of the training split.
 
     Returns:
         ``held_out``: True if no scene is shared, False if some are, None if the training data is

@@ -30,7 +30,7 @@ from pewm_jax.report.video import encode_gif, encode_h264, side_by_side, small_f
 from pewm_jax.types import Frames
 
 ABOVE_CAMERA_M = 0.4
-"""Map cells higher than this above the camera are left out of the view from above."""
+"""Height above the camera from which map cells are omitted in the top view, metres."""
 DOT_M = 0.1
 """Size at which points of a memory without cells are drawn, metres."""
 CAPTIONS = {
@@ -39,27 +39,27 @@ CAPTIONS = {
     "model": "no memory",
     "reproject": "reprojected",
 }
-"""The methods in images, in their order, and their names."""
+"""The methods in images, in order, with their labels."""
 HOLD = 4
-"""Video frames for which the observed image is held."""
+"""Number of video frames for which the observed image is shown."""
 MASKS_NOTE = (
     "Pixels that count as seen before are in colour, the others grey. A pixel counts as seen if "
-    "its true point in space projects into an observed frame whose true depth agrees within the "
+    "its true 3D point projects into an observed frame whose true depth agrees within the "
     f"larger of {100 * TOLERANCE_M:.0f} cm and {100 * TOLERANCE_RELATIVE:.0f} %. No network is "
     "involved."
 )
 ABOVE_NOTE = (
-    "Each square is one cell of the model's 3D map in the colour it remembers, drawn from below to "
-    f"above. Cells more than {ABOVE_CAMERA_M:g} m above the camera (the ceiling) are left out. The "
-    "red line is the agent's path through the frames the map was built from, the arrow its view "
-    "direction. On the right, the same map after the rollout of the stills above added its "
+    "Each square is one cell of the model's 3D map in its stored colour, drawn from bottom to top. "
+    f"Cells more than {ABOVE_CAMERA_M:g} m above the camera (the ceiling) are omitted. The red "
+    "line is the agent's path through the frames from which the map was built, the arrow its view "
+    "direction. On the right: the same map after the rollout of the stills above, including its "
     "imagined frames."
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class _Rollout:
-    """A long rollout, with the true frames and its methods' (colours, depth)."""
+    """A long rollout: ground-truth frames and each method's (colours, depth)."""
 
     choice: ClipChoice
     context: Frames
@@ -71,8 +71,8 @@ class _Rollout:
 def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts) -> Gallery:
     """Draw the images and encode the videos.
 
-    The images show the rollout with the most pixels seen before. This choice depends on geometry
-    alone, never on how well a method did.
+    The images show the rollout with the most pixels seen before. This choice depends only on
+    geometry, never on a method's scores.
     """
     shown = [_gather(config, episodes, long, index) for index in range(long.shown)]
     best = max(range(len(shown)), key=lambda index: float(shown[index].seen_THW.mean()))
@@ -152,8 +152,8 @@ def _video(config: Config, long: LongRollouts, item: _Rollout) -> tuple[str, byt
     ]
     count = len(item.truth.depth_THW)
     share = item.seen_THW.mean((1, 2))
-    footers = ["the present, observed by all"] + [
-        f"imagined frame {t + 1} of {count}: {100 * share[t]:.0f} % of it was seen before"
+    footers = ["the present frame, observed by all"] + [
+        f"imagined frame {t + 1} of {count}: {100 * share[t]:.0f} % of its pixels were seen before"
         for t in range(count)
     ]
     pictures = side_by_side(columns, footers, far_m=farthest(item.truth))
@@ -174,7 +174,7 @@ def _moving(item: _Rollout) -> bytes:
 
 
 def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np.ndarray:
-    """Draw the map before and after a rollout side by side, to one scale."""
+    """Draw the map before and after a rollout side by side, at the same scale."""
     kept = long.kept["memory"]
     poses = np.asarray(item.context.camera.world_from_camera)
     later = np.asarray(item.truth.camera.world_from_camera)

@@ -1,9 +1,9 @@
 """Long rollouts of several worlds: hundreds of frames from one start by the recorded actions.
 
 PERSIST's protocol (arXiv 2603.03482): windows of 16 frames that end at 200, 400 and 600 imagined
-frames of held-out walks, compared with the true ones as sets (FVD, KVD). Beside that PSNR by
-stretches of the walk, which says how stable a world is; for ``persist`` also that of its renderer
-given the true voxels, which bounds it, and what is left of it without its voxels.
+frames of held-out walks are compared with the ground truth as sets (FVD, KVD). In addition, PSNR
+per segment of the walk measures stability over time; for ``persist`` worlds also the PSNR of the
+renderer given the true voxels (an upper bound), and the score without its voxels.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from pewm_jax.types import Camera, Control, Params
 from pewm_jax.worlds.persist import world as persist
 
 WINDOW = 16
-"""Frames of a window."""
+"""Frames per window."""
 CHUNK = 40
-"""Frames that are imagined by one call."""
+"""Frames imagined per call."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,12 +39,12 @@ class RecordedWalk:
     """A held-out walk.
 
     Attributes:
-        name: of the episode.
-        context: (S) observed frames, the present last.
-        actions_T3: the recorded actions after it.
-        truth_THWC: uint8 colours of the frames that they lead to.
-        camera: (T) cameras of these.
-        classes_TXYZ: recorded voxels of these, or None.
+        name: name of the episode.
+        context: (S,) observed frames, the present last.
+        actions_T3: (T, 3) recorded actions after the present frame.
+        truth_THWC: (T, H, W, 3) uint8 colours of the frames after these actions.
+        camera: (T,) cameras of these frames.
+        classes_TXYZ: recorded voxels of these frames, or None.
         origin_T3: their lowest corners, or None.
         first: voxels and corner of the present frame, or None.
     """
@@ -67,12 +67,12 @@ def read_walk(episode: Episode, start: int, frames: int, context: int) -> Record
     """
     if start + frames >= episode.length or start + 1 < context:
         raise UserError(
-            f"episode {episode.name} has {episode.length} frames, and {context} observed ones and "
-            f"{frames} more from {start} on do not lie in it: collect longer episodes (pewm-jax "
+            f"episode {episode.name} has {episode.length} frames, too few for {context} observed "
+            f"ones and {frames} more from frame {start} on: collect longer episodes (pewm-jax "
             "data collect DATA --frames …)."
         )
     if episode.actions is None or episode.actions.shape[1] != PLANAR:
-        raise UserError(f"episode {episode.name} has no planar actions, by which worlds are led.")
+        raise UserError(f"episode {episode.name} has no planar actions to drive worlds.")
     after = np.arange(start + 1, start + frames + 1)
     seen = episode.frames(range(start + 1 - context, start + 1))
     true = episode.frames(after)
@@ -101,22 +101,22 @@ def imagine_walks(
     known: bool = False,
     label: str = "imagining",
 ) -> np.ndarray:
-    """Imagine all walks at once; returns (B, T, H, W, 3) uint8 colours.
+    """Imagine all walks in one batch and return (B, T, H, W, 3) uint8 colours.
 
     Args:
         config: the experiment.
         params: its weights.
-        walks: of one length.
+        walks: walks of equal length.
         memory: False goes on from the last picture alone, clip after clip.
-        known: begins in the recorded grid of the present frame, of a ``persist`` world.
-        label: name of the work in the progress line.
+        known: whether a ``persist`` world starts from the recorded grid of the present frame.
+        label: label of the progress line.
     """
     model = config.model
     each = CHUNK if memory else model.clip.frames - 1
     imagine = functools.partial(worlds.imagine, model, memory=memory)
     imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
     if known:
-        state = _begun(config, params, walks)
+        state = _start_from_grids(config, params, walks)
     else:
         start = jax.jit(jax.vmap(functools.partial(worlds.start, model), (None, 0)))
         state = start(params, _stacked([walk.context for walk in walks]))
@@ -132,11 +132,11 @@ def imagine_walks(
 
 
 def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> np.ndarray:
-    """Return what the renderer of a ``persist`` world makes of the true voxels and cameras."""
+    """Return the frames that a ``persist`` world renders from the true voxels and cameras."""
     model: PersistConfig = config.model
     render = functools.partial(persist.render_true, model)
     render = jax.jit(jax.vmap(render, (None, 0, 0, 0, 0, 0)))
-    state = _begun(config, params, walks)
+    state = _start_from_grids(config, params, walks)
     whole: Any = _stacked(
         [
             (Control(walk.camera, walk.actions_T3), walk.classes_TXYZ, walk.origin_T3)
@@ -153,8 +153,8 @@ def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) 
     return _in_chunks(count, CHUNK, "rendering true voxels", state, made)
 
 
-def _begun(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> Any:
-    """Return the worlds that begin in the recorded grids of the present frames."""
+def _start_from_grids(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> Any:
+    """Return the worlds that start from the recorded grids of the present frames."""
     context = _stacked([jax.tree.map(lambda x: x[-1:], walk.context) for walk in walks])
     firsts = [walk.first for walk in walks if walk.first is not None]
     cells, corners = (np.stack(part) for part in zip(*firsts, strict=True))
@@ -163,14 +163,14 @@ def _begun(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> Any
 
 
 def stretches(made: np.ndarray, truth: np.ndarray, ends: Sequence[int]) -> list[float]:
-    """Return the PSNR, decibels, of the frames from each end to the next, the mean of frames'."""
+    """Return the mean frame PSNR in dB of each segment between consecutive ends."""
     error = np.square(np.asarray(unit_colours(made)) - np.asarray(unit_colours(truth)))
     each = np.asarray(psnr(error.mean((0, 2, 3, 4))))
     return [float(each[low:high].mean()) for low, high in zip((0, *ends[:-1]), ends, strict=True)]
 
 
 def windows(video_BTHWC: np.ndarray, end: int, count: int) -> np.ndarray:
-    """Return the last ``count`` windows of 16 frames before an end, of every walk."""
+    """Return the last ``count`` windows of 16 frames before frame ``end`` of every walk."""
     first = max(0, end - count * WINDOW)
     cut = video_BTHWC[:, first:end]
     cut = cut[:, len(cut[0]) % WINDOW :]

@@ -1,9 +1,8 @@
 """Means over houses with 95 % intervals: mean within a house first, then a bootstrap over houses.
 
-Clips of one house show the same rooms, so a house is what is drawn again, with all its clips
-(the percentile bootstrap of Efron & Tibshirani 1993, chapter 13). Training seeds are another
-matter: what another training would give says nothing about other houses, and has an interval of
-its own, Student's.
+Clips of one house show the same rooms, so houses are resampled, each with all its clips (the
+percentile bootstrap of Efron & Tibshirani 1993, chapter 13). Variation over training seeds is
+separate: it says nothing about other houses, and gets its own interval (Student's t).
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from pewm_jax.eval.statistics import scores
 from pewm_jax.report.labels import own_method
 
 DRAWS, SEED, LEVEL = 10_000, 0, 0.95
-"""Bootstrap samples, the seed that they are drawn from, and the share that an interval holds."""
+"""Number of bootstrap samples, their seed, and the confidence level."""
 
 
 def how() -> dict[str, Any]:
-    """Return how intervals are made, for ``metrics.json``."""
+    """Return the description of the intervals for ``metrics.json``."""
     return {
         "mean": "over houses, of the means within a house, sampling seeds averaged within a clip",
         "interval": "percentile bootstrap over houses",
@@ -40,21 +39,21 @@ def within_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> np.ndarray:
     """Average the clips of each house.
 
     Args:
-        values_CX: (C, …) a number per clip; NaN where a clip has none.
-        houses_C: (C,) the number of each clip's house.
+        values_CX: (C, …) a value per clip; NaN if a clip has none.
+        houses_C: (C,) index of each clip's house.
 
     Returns:
-        (H, …) in the order of the houses' numbers; NaN where no clip of a house has a number.
+        (H, …) in the order of house indices; NaN if no clip of a house has a value.
     """
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a mean of nothing is NaN
+        warnings.simplefilter("ignore", RuntimeWarning)  # the mean of an empty set is NaN
         means = [np.nanmean(values_CX[houses_C == house], axis=0) for house in np.unique(houses_C)]
     return np.stack(means)
 
 
 @functools.cache
 def drawn(houses: int) -> np.ndarray:
-    """Return how often each house is in each bootstrap sample, (draws, houses)."""
+    """Return the count of each house in each bootstrap sample, (draws, houses)."""
     indices = np.random.default_rng(SEED).integers(houses, size=(DRAWS, houses))
     counts = np.zeros((DRAWS, houses))
     np.add.at(counts, (np.arange(DRAWS)[:, None], indices), 1)
@@ -64,16 +63,16 @@ def drawn(houses: int) -> np.ndarray:
 def over_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, np.ndarray]:
     """Return the mean over houses and its interval.
 
-    The same houses are drawn whatever the values are, so that intervals of methods that are scored
-    in the same houses can be set side by side.
+    The bootstrap samples do not depend on the values, so intervals of methods that are scored in
+    the same houses are comparable.
 
     Args:
-        values_CX: (C, …) a number per clip; NaN where a clip has none.
-        houses_C: (C,) the number of each clip's house.
+        values_CX: (C, …) a value per clip; NaN if a clip has none.
+        houses_C: (C,) index of each clip's house.
 
     Returns:
-        ``mean``, ``low``, ``high`` and ``houses``, each (…): NaN where there is nothing, and for
-        ``low`` and ``high`` where fewer than two houses have a number.
+        ``mean``, ``low``, ``high`` and ``houses``, each (…): NaN if there is no value; ``low`` and
+        ``high`` also if fewer than two houses have a value.
     """
     means_HX = within_houses(np.asarray(values_CX, np.float64), np.asarray(houses_C))
     shape, means_HN = means_HX.shape[1:], means_HX.reshape(len(means_HX), -1)
@@ -85,14 +84,14 @@ def over_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, np.nda
     tail = (1 - LEVEL) / 2
     ends_2N = np.full((2, len(mean_N)), np.nan)
     for n in np.flatnonzero(houses_N > 1):
-        sample_D = sample_DN[np.isfinite(sample_DN[:, n]), n]  # some draw houses without a number
+        sample_D = sample_DN[np.isfinite(sample_DN[:, n]), n]  # skip samples without values
         ends_2N[:, n] = np.quantile(sample_D, [tail, 1 - tail])
     found = {"mean": mean_N, "low": ends_2N[0], "high": ends_2N[1], "houses": houses_N}
     return {name: array.reshape(shape) for name, array in found.items()}
 
 
 def _samples(means_HN: np.ndarray) -> np.ndarray:
-    """Return the mean of each bootstrap sample of houses, (draws, N); NaN where there is none."""
+    """Return the mean of each bootstrap sample of houses, (draws, N); NaN if it has no value."""
     known_HN = np.isfinite(means_HN)
     counts_DH = drawn(len(means_HN))
     with np.errstate(invalid="ignore"):
@@ -100,15 +99,15 @@ def _samples(means_HN: np.ndarray) -> np.ndarray:
 
 
 def p_over_houses(values_C: np.ndarray, houses_C: np.ndarray) -> float | None:
-    """Return the two-sided p value of a mean of 0, from the bootstrap that makes the intervals.
+    """Return the two-sided p value of the null hypothesis "mean = 0", from the same bootstrap.
 
     It is twice the smaller share of samples on one side of 0, counted as (k + 1) / (draws + 1)
-    (Davison & Hinkley 1997, section 4.4), so that it is below 0.05 where the 95 % interval leaves
-    out 0. None where fewer than two houses have a number.
+    (Davison & Hinkley 1997, section 4.4), so that it is below 0.05 if the 95 % interval excludes 0.
+    None if fewer than two houses have a value.
 
     Args:
-        values_C: (C,) a difference per clip; NaN where a clip has none.
-        houses_C: (C,) the number of each clip's house.
+        values_C: (C,) a difference per clip; NaN if a clip has none.
+        houses_C: (C,) index of each clip's house.
     """
     means_H = within_houses(np.asarray(values_C, np.float64), np.asarray(houses_C))
     if np.isfinite(means_H).sum() < 2:
@@ -120,9 +119,9 @@ def p_over_houses(values_C: np.ndarray, houses_C: np.ndarray) -> float | None:
 
 
 def p_over_seeds(values: Sequence[float]) -> float | None:
-    """Return the two-sided p value of a mean of 0 over training seeds: Student's, of one sample.
+    """Return the two-sided p value of "mean = 0" over training seeds (one-sample t-test).
 
-    None where there are fewer than two.
+    None for fewer than two values.
     """
     if len(values) < 2:
         return None
@@ -140,7 +139,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     any of them is a false positive is at most α.
 
     Args:
-        p_values: of one family of comparisons; None where there is none, which does not count.
+        p_values: p values of one family of comparisons; None entries are not counted.
 
     Returns:
         The adjusted values, in the same order.
@@ -155,23 +154,23 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def entry(values_CX: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
-    """Return ``over_houses`` for JSON: numbers, or lists for more than one; None for NaN."""
+    """Return ``over_houses`` for JSON: numbers, or lists if there are several; None for NaN."""
     found = over_houses(values_CX, houses_C)
     nothing = np.array(None)
     return {n: np.where(np.isfinite(array), array, nothing).tolist() for n, array in found.items()}
 
 
 def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any]:
-    """Return every method's scores, and the differences from the model itself, paired.
+    """Return every method's scores, and the paired differences from the model itself.
 
     Args:
         sums: method → (seeds, clips, T, 3, 9) as ``images.error_sums``.
-        houses_C: (clips,) the number of each clip's house.
+        houses_C: (clips,) index of each clip's house.
 
     Returns:
         ``results[method][mask][metric]`` and ``margins[method][mask][metric]`` (the model minus
-        that method, clip by clip) as ``entry``; ``per_frame`` and ``per_frame_margins`` the same
-        with a list over imagined frames in the place of each number.
+        that method, paired by clip) as ``entry``; ``per_frame`` and ``per_frame_margins`` likewise,
+        with a list over imagined frames in place of each number.
     """
     whole = {method: scores(sums_SCT39.sum(2)) for method, sums_SCT39 in sums.items()}
     frame = {method: scores(sums_SCT39) for method, sums_SCT39 in sums.items()}
@@ -184,7 +183,7 @@ def table(sums: Mapping[str, np.ndarray], houses_C: np.ndarray) -> dict[str, Any
 
 
 def _minus(by_method: Mapping[str, Any]) -> dict[str, Any]:
-    """Subtract every other method's scores from the model's own; sampling seeds averaged."""
+    """Subtract every other method's scores from the model's, averaged over sampling seeds."""
     own = own_method(by_method)
     mine = by_method[own]
     return {
@@ -214,15 +213,16 @@ def _each(by_method: Mapping[str, Any], houses_C: np.ndarray) -> dict[str, Any]:
 
 
 def over_seeds(values: Sequence[float], others: Sequence[float] = ()) -> dict[str, Any]:
-    """Return the mean over training seeds and Student's 95 % interval; or a difference of means.
+    """Return the mean over training seeds with Student's 95 % interval, or a difference.
 
     Args:
-        values: a number per training seed.
-        others: numbers of another model's training seeds, which need not be as many; if given,
-            the difference first − second is meant (Welch 1947, degrees of freedom rounded down).
+        values: one value per training seed.
+        others: values of another model's training seeds, possibly of another number; if given, the
+            difference first − second is returned (Welch 1947, degrees of freedom rounded down).
 
     Returns:
-        ``mean``, ``low`` and ``high``; the last two are None unless both have two seeds or more.
+        ``mean``, ``low`` and ``high``; the last two are None unless all groups have two seeds or
+        more.
     """
     groups = [np.asarray(group, np.float64) for group in (values, others) if len(group)]
     mean = float(groups[0].mean() - (groups[1].mean() if len(groups) > 1 else 0))

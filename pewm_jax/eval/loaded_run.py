@@ -17,7 +17,7 @@ from pewm_jax.worlds.rollouts import load_finished
 
 WEIGHTS = "weights.safetensors"
 OWN = "report"
-"""The folder in a run for the report of its own data."""
+"""Folder in a run for the report on its own data."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,11 +25,11 @@ class LoadedRun:
     """A trained run.
 
     Attributes:
-        folder: where its configuration and weights are; may be read-only.
-        home: the folder that its reports go to.
+        folder: folder of its configuration and weights; may be read-only.
+        home: folder to which its reports are written.
         config: its configuration.
         params: its weights.
-        weights_hash: sha256 of the file of weights.
+        weights_hash: sha256 of the weights file.
     """
 
     folder: Path
@@ -40,7 +40,7 @@ class LoadedRun:
 
     @property
     def steps(self) -> dict[str, int]:
-        """The steps that its weights were trained for, by stage."""
+        """Return the number of training steps of its weights, by stage."""
         facts = weights.metadata(self.folder / WEIGHTS)
         last, done = int(facts.get("stage", 0)), int(facts.get("step", 0))
         return {
@@ -51,11 +51,11 @@ class LoadedRun:
 
 
 def folders(run: str | Path) -> tuple[Path, Path]:
-    """Return where a run is and where its reports go.
+    """Return the folder of a run and the folder for its reports.
 
     Args:
-        run: a run folder, or the name of a model that comes with the library: its files are in
-            the package, which is not written to, and its reports go to ``runs/NAME``.
+        run: a run folder, or the name of a model that ships with the library: its files are in the
+            package, which is not written to, and its reports go to ``runs/NAME``.
 
     Raises:
         UserError: there is no such folder.
@@ -70,11 +70,11 @@ def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
     """Load a run of a world model.
 
     Args:
-        run: a run folder, or the name of a model that comes with the library.
-        config: its configuration, if it is read already.
+        run: a run folder, or the name of a model that ships with the library.
+        config: its configuration, if already loaded.
 
     Raises:
-        UserError: it is absent, damaged, or of a world of which there is no report.
+        UserError: it is missing, damaged, or of a world without reports.
     """
     folder, home = folders(run)
     config, params = load_finished(folder, config=config)
@@ -82,68 +82,68 @@ def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
     return LoadedRun(folder, home, config, params, file_hash(folder / WEIGHTS))
 
 
-def has_memory(opened: LoadedRun) -> bool:
-    """Tell whether a run's model has a memory; False where it was trained without one on purpose.
+def has_memory(loaded: LoadedRun) -> bool:
+    """Return whether a run's model has a memory; False if it was trained without one by intent.
 
-    That is, its memory is of kind ``none``, or no stage that trains one was asked for.
+    That is, its memory is of kind ``none``, or no stage that trains a memory was requested.
 
     Raises:
         UserError: training is not finished.
     """
-    known = stages.all_stages(opened.config)
-    asked = [stage for stage in known if stage.memory and stage.settings(opened.config).steps > 0]
-    can = opened.config.model.capabilities
+    known = stages.all_stages(loaded.config)
+    asked = [stage for stage in known if stage.memory and stage.settings(loaded.config).steps > 0]
+    can = loaded.config.model.capabilities
     if not can.memory_parameters:
-        _require_all_steps(opened)
+        _require_all_steps(loaded)
         return can.memory
-    if can.memory_parameters not in opened.params:
+    if can.memory_parameters not in loaded.params:
         if asked:
             raise UserError(
-                f"{opened.folder / WEIGHTS} has no memory blocks yet, only stage 1 is trained; "
-                "finish training with `python train.py`, which goes on where it stopped."
+                f"{loaded.folder / WEIGHTS} has no memory blocks yet, because only stage 1 is "
+                "trained; finish training with `python train.py`, which resumes."
             )
-        _require_all_steps(opened)
+        _require_all_steps(loaded)
         return False
     return can.memory
 
 
-def _require_all_steps(opened: LoadedRun) -> None:
-    """Refuse a run of which a stage was trained for fewer steps than its settings ask for."""
-    for stage in stages.all_stages(opened.config):
-        wanted = stage.settings(opened.config).steps
-        done = opened.steps.get(stage.name, wanted if not opened.steps else 0)
+def _require_all_steps(loaded: LoadedRun) -> None:
+    """Raise an error if a stage was trained for fewer steps than configured."""
+    for stage in stages.all_stages(loaded.config):
+        wanted = stage.settings(loaded.config).steps
+        done = loaded.steps.get(stage.name, wanted if not loaded.steps else 0)
         if done < wanted:
             raise UserError(
-                f"{opened.folder / WEIGHTS} is of step {done} and {wanted} of {stage.name} were "
-                "asked for; finish training with `python train.py`, which goes on where it stopped."
+                f"{loaded.folder / WEIGHTS} is from step {done} of {wanted} of {stage.name}; "
+                "finish training with `python train.py`, which resumes."
             )
 
 
-def report_folder(opened: LoadedRun, config: Config) -> Path:
-    """Return where the report of some data goes: ``report``, or ``report-NAME`` of other data.
+def report_folder(loaded: LoadedRun, config: Config) -> Path:
+    """Return the folder of a report: ``report``, or ``report-NAME`` for other data.
 
     Args:
-        opened: the run.
+        loaded: the run.
         config: its configuration, with overrides for the evaluation.
     """
     data, split = Path(config.data.path), config.evaluate.split
     other = []
-    if data.resolve() != Path(opened.config.data.path).resolve():
+    if data.resolve() != Path(loaded.config.data.path).resolve():
         other.append(data.resolve().name)
-    if split != opened.config.evaluate.split:
+    if split != loaded.config.evaluate.split:
         other.append(split.strip("/").replace("/", "-") or "all")
-    return opened.home / "-".join([OWN, *other])
+    return loaded.home / "-".join([OWN, *other])
 
 
-def open_none(opened: LoadedRun, config: Config) -> LoadedRun | None:
-    """Open the run without a memory that ``evaluate.none`` names, or return None.
+def open_none(loaded: LoadedRun, config: Config) -> LoadedRun | None:
+    """Open the reference run without a memory (``evaluate.none``), or return None.
 
-    Its configuration gets the protocol of the evaluation: the same clips, context, batch
-    and number of sampling steps.
+    Its configuration gets the protocol of the evaluation: the same clips, context, batch and number
+    of sampling steps.
 
     Raises:
-        UserError: it does not exist, or cannot be compared: other clips or another codec, or fewer
-            steps without a memory than the model has in all.
+        UserError: it does not exist, or is not comparable: it has other clips or another codec, or
+            was trained for fewer steps than the model's stages in total.
     """
     name = config.evaluate.none
     if not name:
@@ -153,15 +153,15 @@ def open_none(opened: LoadedRun, config: Config) -> LoadedRun | None:
         there, here = (getattr(one.model, part, None) for one in (other.config, config))
         if there != here:
             raise UserError(
-                f"evaluate.none: {name} has another {part} than {opened.folder} "
-                f"({_difference(there, here)}), so they cannot be compared; train one with the "
+                f"evaluate.none: {name} has another {part} than {loaded.folder} "
+                f"({_difference(there, here)}), so they are not comparable; train one with the "
                 "same."
             )
-    done, needed = _without_memory(other), _in_all(opened)
+    done, needed = _steps_without_memory(other), _total_steps(loaded)
     if done < needed:
         raise UserError(
             f"evaluate.none: {name} was trained for {done} steps without a memory and "
-            f"{opened.folder} for {needed} in all; train it longer{_how(opened, needed)}, "
+            f"{loaded.folder} for {needed} in total; train it longer{_flags_for(loaded, needed)}, "
             "or the comparison would favour the memory."
         )
     model = other.config.model
@@ -173,9 +173,9 @@ def open_none(opened: LoadedRun, config: Config) -> LoadedRun | None:
     return dataclasses.replace(other, config=laid)
 
 
-def _how(opened: LoadedRun, steps: int) -> str:
-    """Return the flags that train a world as long without its memory, in brackets."""
-    known = [stage for stage in stages.all_stages(opened.config) if not stage.optional]
+def _flags_for(loaded: LoadedRun, steps: int) -> str:
+    """Return the flags that train a world for as many steps without its memory, in brackets."""
+    known = [stage for stage in stages.all_stages(loaded.config) if not stage.optional]
     alone = next((stage for stage in known if not stage.memory), None)
     if alone is None:
         return ""
@@ -184,26 +184,26 @@ def _how(opened: LoadedRun, steps: int) -> str:
     return f" ({' '.join(flags)})"
 
 
-def none_facts(none: LoadedRun, opened: LoadedRun) -> dict[str, Any]:
-    """Return what the report says of the run without a memory."""
+def none_facts(none: LoadedRun, loaded: LoadedRun) -> dict[str, Any]:
+    """Return the report's entry on the run without a memory."""
     return {
         "run": str(none.folder),
         "weights_sha256": none.weights_hash,
-        "steps": _without_memory(none),
-        "steps_with_memory": _in_all(opened),
+        "steps": _steps_without_memory(none),
+        "steps_with_memory": _total_steps(loaded),
     }
 
 
-def _in_all(opened: LoadedRun) -> int:
-    """Return the steps of all stages: those done, or those planned where the file does not say."""
-    planned = [stage.settings(opened.config).steps for stage in stages.all_stages(opened.config)]
-    return sum(opened.steps.values() or planned)
+def _total_steps(loaded: LoadedRun) -> int:
+    """Return the number of steps of all stages: those done, or those planned if unknown."""
+    planned = [stage.settings(loaded.config).steps for stage in stages.all_stages(loaded.config)]
+    return sum(loaded.steps.values() or planned)
 
 
-def _without_memory(opened: LoadedRun) -> int:
-    """Return the steps of the stages that train the part that works without a memory."""
-    known = {stage.name: stage for stage in stages.all_stages(opened.config)}
-    return sum(steps for name, steps in opened.steps.items() if not known[name].memory)
+def _steps_without_memory(loaded: LoadedRun) -> int:
+    """Return the number of steps of the stages that train the model without its memory."""
+    known = {stage.name: stage for stage in stages.all_stages(loaded.config)}
+    return sum(steps for name, steps in loaded.steps.items() if not known[name].memory)
 
 
 def _difference(there: Any, here: Any) -> str:

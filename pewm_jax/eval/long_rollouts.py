@@ -1,7 +1,7 @@
-"""Long rollouts: clip after clip from the model's own last frame; can be resumed.
+"""Long rollouts: consecutive clips, each from the model's own last frame; resumable.
 
-Stored are the errors of every frame, the frames and the map of the first few rollouts, and how many
-points the model's memory holds after each clip.
+Stored are the errors of every frame, the frames and the map of the first few rollouts, and the
+number of points in the model's memory after each clip.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from pewm_jax.types import WorldState
 
 @dataclasses.dataclass(frozen=True)
 class LongRollouts:
-    """Scored long rollouts; the frames of the first few are stored, to be shown.
+    """Scored long rollouts; the frames of the first few are stored for display.
 
     Attributes:
         scored: errors over all of them.
-        chain: clips generated one after the other.
+        chain: number of consecutive clips.
         shown: number of rollouts whose frames are stored.
         kept: per method ``rgb`` (shown, N, H, W, 3) uint8 and ``depth`` (shown, N, H, W) metres;
             for ``memory`` also the map at the start and the end: ``first_points``,
             ``first_features``, ``first_valid``, and the same with ``last``; and ``occupied``
-            (rollouts, chain + 1), what the map holds at the start and after each clip.
+            (rollouts, chain + 1), the number of points in the map at the start and after each clip.
     """
 
     scored: Scored
@@ -56,10 +56,10 @@ def roll_long(
     lpips: LPIPS | None = None,
     choices: list[ClipChoice] | None = None,
 ) -> LongRollouts:
-    """Make long rollouts with every method (first seed), score all, store the first few.
+    """Make long rollouts with every method (first seed), score all, and store the first few.
 
-    Without ``lpips`` that is left out. Without ``choices`` they are those of ``long_choices``.
-    Several processes share the work, and all return all of it.
+    Without ``lpips`` it is not measured. Without ``choices`` they are those of ``long_choices``.
+    Several processes share the work, and all return the whole result.
 
     Raises:
         UserError: as for ``scoring.score_table``.
@@ -106,12 +106,12 @@ def roll_long(
 
 
 def _shown(shown: int, first: int, rollouts: int, size: int) -> int:
-    """Return the number of rollouts of a batch that are shown."""
+    """Return the number of rollouts of a batch to display."""
     return min(max(shown - first, 0), size, rollouts - first)
 
 
 def _joined(parts: Sequence[dict[str, np.ndarray]], shown: int) -> dict[str, np.ndarray]:
-    """Join batches; of the shown rollouts no more than are asked for now."""
+    """Concatenate batches; keep at most ``shown`` rollouts for display."""
     joined = {key: np.concatenate([part[key] for part in parts if key in part]) for key in parts[0]}
     every = ("sums", "occupied")
     return {key: array if key in every else array[:shown] for key, array in joined.items()}
@@ -150,7 +150,7 @@ def _roll(
 
 
 def occupied(config: Config, maps: Any) -> np.ndarray:
-    """Return how many points each map of a batch holds, (B,): cells, surfels or patches."""
+    """Return the number of points in each map of a batch, (B,): cells, surfels or patches."""
     return np.asarray(_occupied(config, maps))
 
 

@@ -1,10 +1,10 @@
-"""The mirror test: the agent goes a way and comes back. Does it see the same places again?
+"""The mirror test: the agent goes out and returns the same way. Does it see the same places again?
 
-From the start of each long rollout the model imagines the first frames of the recorded way, then
-the same way back: it was walked, so it is free. Each place is thus visited twice, and the later a
-place lies on the way out, the fewer frames are between both visits. What is imagined at the second
-visit is compared with the first (``metrics.revisits``), and both with the truth: a model that
-always shows one picture comes back to it perfectly.
+From the start of each long rollout the model imagines the first frames of the recorded path, then
+the same path backwards; it is collision-free because it was walked. Each place is visited twice;
+the later a place lies on the way out, the fewer frames are between the visits. The second visit is
+compared with the first (``metrics.revisits``), and both with the ground truth: a model that always
+shows one image is perfectly consistent.
 """
 
 from __future__ import annotations
@@ -33,25 +33,26 @@ from pewm_jax.report.labels import own_method
 from pewm_jax.types import Frames
 
 USUAL, LONG = 32, 64
-"""Frames on the way out where nothing else is asked for, in long rollouts of at least so many."""
+"""Default number of frames on the way out, for long rollouts of at least this length."""
 VERSION = 1
-"""Increase it whenever the same settings would give other numbers."""
+"""Increase it whenever the same settings would give different numbers."""
 PAIRS = ("again", "out", "back")
-"""The second visit against the first; the first and the second against the truth; PSNR."""
+"""PSNR of: the second visit against the first; the first and the second visit against the ground
+truth."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Mirror:
-    """What the mirror test found.
+    """The results of the mirror test.
 
     Attributes:
         scored: the R rollouts, without errors.
-        out: frames on the way out, K.
-        values: method → measure → (R,), both visits compared; of ``truth`` the ceiling.
-        floor: measure → (R,), the truth's way out against another rollout's way back; empty where
-            there is but one rollout.
-        pairs: method → one of ``PAIRS`` → (R, K) decibels, by ``distances``; NaN where the first
-            visit is the observed frame.
+        out: K, number of frames on the way out.
+        values: method → metric → (R,), both visits compared; the entry ``truth`` is the ceiling.
+        floor: metric → (R,), the ground truth's way out against another rollout's return path;
+            empty if there is only one rollout.
+        pairs: method → one of ``PAIRS`` → (R, K) dB, by ``distances``; NaN where the first visit is
+            the observed frame.
     """
 
     scored: Scored
@@ -62,31 +63,31 @@ class Mirror:
 
     @property
     def distances(self) -> list[int]:
-        """Frames between both visits: 2, 4, …, 2 K."""
+        """Return the numbers of frames between both visits: 2, 4, …, 2 K."""
         return [2 * (k + 1) for k in range(self.out)]
 
 
 def way_out(config: Config, rollouts: Sequence[ClipChoice]) -> tuple[int, str]:
-    """Return how many frames the agent goes before it comes back, 0 for no test, and a sentence.
+    """Return the number of frames on the way out (0 for no test), and a description.
 
     Args:
-        config: gives ``evaluate.mirror`` and the length of clips: whole ones are imagined.
+        config: ``evaluate.mirror`` and the clip length are used; whole clips are imagined.
         rollouts: the long rollouts.
     """
     asked, there = config.evaluate.mirror, len(rollouts[0].targets_N)
     if asked == 0:
-        return 0, "The mirror test is left out, as evaluate.mirror says."
+        return 0, "The mirror test is disabled (evaluate.mirror)."
     if asked < 0 and there < LONG:
         return 0, (
-            f"The mirror test is left out: long rollouts have {there} frames and not {LONG}; "
-            f"--mirror {USUAL} asks for it, or as many frames as they have."
+            f"The mirror test is skipped: long rollouts have {there} frames, fewer than {LONG}; "
+            f"request it with --mirror {USUAL}, or a number of frames that they have."
         )
     each = config.model.clip.frames - 1
     fits = [k for k in range(1, min(asked if asked > 0 else USUAL, there) + 1) if not 2 * k % each]
     if not fits:
         return 0, (
-            f"The mirror test is left out: {asked} frames out and back do not fill a clip of "
-            f"{each} imagined frames; name more by --mirror."
+            f"The mirror test is skipped: {asked} frames out and back do not fill a clip of "
+            f"{each} imagined frames; give a larger number by --mirror."
         )
     return fits[-1], (
         f"{fits[-1]} frames along the recorded way and back the same way, {len(rollouts)} "
@@ -103,18 +104,18 @@ def mirror_test(
     measures: Mapping[str, Revisit],
     log: Callable[[str], Any] = print_now,
 ) -> Mirror | None:
-    """Do the mirror test with every method that is a network (first seed); None if it is left out.
+    """Run the mirror test with every method that is a network (first seed); None if it is skipped.
 
     Results in ``cache`` are reused; several processes share the work.
 
     Args:
         config: the experiment.
         episodes: held-out episodes.
-        methods: who imagines.
+        methods: the methods.
         cache: where results are stored.
-        rollouts: the long rollouts, of whose ways the first frames are taken.
-        measures: by which both visits are compared (``metrics.selection.revisits``).
-        log: shows a line.
+        rollouts: the long rollouts, whose first frames are the paths.
+        measures: metrics that compare both visits (``metrics.selection.select_revisits``).
+        log: prints a line.
 
     Raises:
         UserError: as for ``scoring.score_table``.
@@ -179,7 +180,7 @@ def mirror_test(
 
 
 def _digest(measures: Mapping[str, Revisit]) -> str:
-    """Return a hash of what both visits are compared by."""
+    """Return a hash of the metrics that compare both visits."""
     content = [VERSION, [[n, getattr(m.compare, "sha256", "")] for n, m in measures.items()]]
     return inputs_hash(content)[:12]
 
@@ -191,7 +192,7 @@ def _there_and_back(
     first: int,
     cameras: bool,
 ) -> Batch:
-    """Read a batch of ways out, and turn each round at its end; the targets are all 2 K frames."""
+    """Read a batch of ways out and mirror each at its end; the targets are all 2 K frames."""
     size = config.evaluate.batch
     parts = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
     context, targets = stack([part[0] for part in parts], size), stack([p[1] for p in parts], size)
@@ -208,7 +209,7 @@ def _there_and_back(
 def _of_truth(
     batch: Batch, other: Batch | None, measures: Mapping[str, Revisit]
 ) -> dict[str, np.ndarray]:
-    """Return the ceilings and, given the ways of other rollouts, the floors."""
+    """Return the ceilings and, given the paths of other rollouts, the floors."""
     truth = batch.whole(batch.targets.rgb_THWC)
     made = {f"value/{name}": measure(truth, truth) for name, measure in measures.items()}
     if other is not None:
@@ -220,7 +221,7 @@ def _of_truth(
 def _of_model(
     batch: Batch, frames: Frames, measures: Mapping[str, Revisit]
 ) -> dict[str, np.ndarray]:
-    """Return the measures of imagined ways, and PSNR by distance."""
+    """Return the metrics of imagined paths, and PSNR by distance."""
     truth, imagined = batch.whole(batch.targets.rgb_THWC), batch.whole(frames.rgb_THWC)
     made = {f"value/{name}": measure(imagined, truth) for name, measure in measures.items()}
     (out, back), (real, _) = ways(imagined), ways(truth)
@@ -229,12 +230,12 @@ def _of_model(
         error = jnp.square(unit_colours(one) - unit_colours(two)).mean((2, 3, 4))
         made[f"pair/{name}"] = psnr(error)[:, ::-1]
     arrays = {name: np.array(array) for name, array in made.items()}
-    arrays["pair/out"][:, -1] = np.nan  # the observed frame, which nobody imagined
+    arrays["pair/out"][:, -1] = np.nan  # the observed frame is not imagined
     return arrays
 
 
 def facts(mirror: Mirror) -> dict[str, Any]:
-    """Return the numbers for ``metrics.json``; ``docs/evaluation.md`` describes them."""
+    """Return the results for ``metrics.json``; ``docs/evaluation.md`` describes them."""
     houses = mirror.scored.clusters
     own, truth = own_method(mirror.pairs), mirror.values[TRUTH]
 

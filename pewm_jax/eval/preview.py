@@ -22,28 +22,28 @@ from pewm_jax.train.watch import IMAGINED, Preview, Previewed
 from pewm_jax.types import Frames, Params
 
 SPLIT, CLIPS, SHOWN = "validation", 8, 3
-"""The split of previews, the number of clips scored, and the number of clips shown."""
+"""The split of previews, the number of scored clips, and the number of displayed clips."""
 
 
 def make_preview(
     config: Config, run: Path, log: Callable[[str], Any] = print_now
 ) -> Preview | None:
-    """Prepare previews for a training run, if its data allows any.
+    """Prepare previews for a training run, or return None if its data allows none.
 
-    Previews are optional. Without validation data, or if it is too short, a line says so and there
-    are no previews.
+    Previews are optional: without validation data, or if it is too short, a line is logged and no
+    previews are made.
 
     Args:
         config: the experiment; clips come from ``data.path``/validation.
         run: the run's folder; images and videos go to its folder ``previews/``.
-        log: shows a line that says why there are no previews.
+        log: prints the reason if there are no previews.
 
     Returns:
         ``preview(params, stage, step)``. It imagines the clips with the current weights and
-        measures their PSNR: with its map and with an empty map, or, in a stage without memory (such
-        as PEWM's stage 1), of the model without one. It writes ``previews/stage2-000250.png`` with
-        rows truth, with its map, empty map, and ``previews/stage2-000250.mp4``, the same side by
-        side. It is compiled once per stage. None if there is nothing to preview.
+        measures their PSNR with its map and with an empty map, or, in a stage without memory (such
+        as PEWM's stage 1), of the model without a map. It writes ``previews/stage2-000250.png``
+        with the rows ground truth, with its map, empty map, and ``previews/stage2-000250.mp4``, the
+        same side by side. It is compiled once per stage.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)
@@ -66,45 +66,45 @@ def make_preview(
                 config, params, CLIPS, config.data.context, cameras=cameras
             )
         variants = {"memory": True, "empty": False} if stage.memory else {"model": False}
-        made: dict[str, Frames] = {}
+        imagined: dict[str, Frames] = {}
         for name, memory in variants.items():
-            _, _, made[name] = models[stage.name].run(
+            _, _, imagined[name] = models[stage.name].run(
                 context, control, seeds, memory=memory, params=params
             )
         name = f"{stage.name}-{step:06d}"
         shown = clips[:SHOWN]
-        picture = _picture(shown, made, f"{stage.title}, step {step}")
+        picture = _picture(shown, imagined, f"{stage.title}, step {step}")
         return Previewed(
             (
                 save_png(run / "previews" / f"{name}.png", picture),
-                _save_video(run / "previews" / f"{name}.mp4", shown, made, f"step {step}"),
+                _save_video(run / "previews" / f"{name}.mp4", shown, imagined, f"step {step}"),
             ),
-            {name: _score(clips, frames) for name, frames in made.items()},
+            {name: _score(clips, frames) for name, frames in imagined.items()},
         )
 
     return preview
 
 
 _Loaded = tuple[Frames, Frames, Any]
-"""Context, true frames and control of a clip, as returned by ``protocol.load_clip``."""
+"""Context, ground-truth frames and control of a clip, as returned by ``load_clip``."""
 
 
 def _score(clips: Sequence[_Loaded], frames: Frames) -> float:
-    """Return the mean PSNR, decibels, over frames and clips (B, N)."""
+    """Return the mean PSNR in dB over frames and clips (B, N)."""
     truth = np.stack([true.rgb_THWC for _, true, _ in clips])
     difference = unit_colours(frames.rgb_THWC[: len(clips)]) - unit_colours(truth)
     return float(psnr((difference**2).mean((2, 3, 4))).mean())
 
 
-def _picture(clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str) -> np.ndarray:
-    """Arrange the frames of every clip: a row for the truth, a row for each variant."""
+def _picture(clips: Sequence[_Loaded], imagined: Mapping[str, Frames], title: str) -> np.ndarray:
+    """Arrange the frames of every clip: a row for the ground truth and a row for each variant."""
     rows = []
     for index, (seen, true, _) in enumerate(clips):
         present = seen.rgb_THWC[-1]
         rows.append(("truth", [present, *true.rgb_THWC]))
         rows += [
             (IMAGINED[name], [present, *as_bytes(frames.rgb_THWC[index])])
-            for name, frames in made.items()
+            for name, frames in imagined.items()
         ]
     count = len(clips[0][1].depth_THW)
     columns = ["observed", *(f"{index + 1}" for index in range(count))]
@@ -112,9 +112,9 @@ def _picture(clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str) -
 
 
 def _save_video(
-    path: Path, clips: Sequence[_Loaded], made: Mapping[str, Frames], title: str
+    path: Path, clips: Sequence[_Loaded], imagined: Mapping[str, Frames], title: str
 ) -> Path:
-    """Write a video, atomically: clip after clip, truth and variants side by side."""
+    """Write a video atomically: one clip after another, ground truth and variants side by side."""
     pictures = []
     for index, (seen, true, _) in enumerate(clips):
         columns = [
@@ -123,7 +123,7 @@ def _save_video(
                 ("truth", true.rgb_THWC, true.depth_THW),
                 *(
                     (IMAGINED[name], as_bytes(frames.rgb_THWC[index]), frames.depth_THW[index])
-                    for name, frames in made.items()
+                    for name, frames in imagined.items()
                 ),
             )
         ]

@@ -1,11 +1,11 @@
 """The evaluation protocol as a value with a hash, and its file.
 
 It fixes episodes (by the hash of their content), starts, context, motion, noise and horizon. It
-does not depend on a model, so any two models of its size can be scored by it and compared clip by
-clip. Equal choices have equal hashes, wherever the data are stored.
+does not depend on a model, so any two models of its image size can be evaluated with it and
+compared clip by clip. Equal choices have equal hashes, wherever the data are stored.
 
 The file is written before training and read by ``evaluate``; ``docs/evaluation.md`` describes it.
-Where the data were, and which version wrote the file, are notes that are not hashed.
+The location of the data and the version that wrote the file are notes, which are not hashed.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from pewm_jax.eval.clips import VERSION, ClipChoice, choose, long_choices, needs
 from pewm_jax.io import atomic
 
 NOISE = "key(seed), folded with the clip's place in the list and its number in the chain"
-"""How noise follows from a seed."""
+"""How noise is derived from a seed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EpisodeKey:
-    """An episode, recognised by ``sha256`` of its record: every picture, depth, pose and action."""
+    """An episode, identified by the ``sha256`` of its record (images, depths, poses, actions)."""
 
     name: str
     scene: str
@@ -44,7 +44,7 @@ class ClipKey:
     """A clip to imagine.
 
     Attributes:
-        episode: place in ``Protocol.episodes``.
+        episode: index in ``Protocol.episodes``.
         start: the present frame.
         context: frames observed, oldest first, the present last.
         targets: frames to imagine.
@@ -61,23 +61,23 @@ class ClipKey:
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:
-    """Everything that is chosen.
+    """All choices of an evaluation.
 
     Attributes:
-        split: name of the folder that the episodes were chosen from.
-        height: of a picture, pixels.
-        width: the same.
-        context: frames observed before each clip.
-        stride: recorded actions between two imagined frames.
-        horizon: frames imagined from each start.
-        long_horizon: the same of long rollouts.
-        seeds: of the sampling noise; long rollouts take the first.
-        control: ``actions`` or ``cameras``: what drives the model.
-        episodes: those that clips are of.
-        clips: what is scored, in the order that gives each clip its noise.
+        split: name of the split's folder.
+        height: image height, pixels.
+        width: image width, pixels.
+        context: number of frames observed before each clip.
+        stride: number of recorded actions between two imagined frames.
+        horizon: number of frames imagined from each start.
+        long_horizon: likewise for long rollouts.
+        seeds: seeds of the sampling noise; long rollouts use the first.
+        control: ``actions`` or ``cameras``, which drive the model.
+        episodes: the episodes of the clips.
+        clips: the scored clips, in the order that determines their noise.
         rollouts: the long rollouts.
-        noise: how noise follows from a seed.
-        scoring: version of the rules by which pixels are scored.
+        noise: how noise is derived from a seed.
+        scoring: version of the scoring rules.
     """
 
     split: str
@@ -97,17 +97,17 @@ class Protocol:
 
     @property
     def sha256(self) -> str:
-        """The hash of all choices."""
+        """Return the hash of all choices."""
         return hash_of(dataclasses.asdict(self))
 
     @property
     def pieces_sha256(self) -> str:
-        """The hash of all choices but the seeds: what the scores of one seed depend on."""
+        """Return the hash of all choices except the seeds, for the scores of one seed."""
         return hash_of(dataclasses.asdict(self) | {"seeds": None})
 
 
 def hash_of(content: Any) -> str:
-    """Return the sha256 of a JSON value, whatever the order of its keys."""
+    """Return the sha256 of a JSON value, independent of the order of its keys."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -115,10 +115,10 @@ def hash_of(content: Any) -> str:
 def choose_clips(
     config: Config, episodes: Sequence[Episode]
 ) -> tuple[list[ClipChoice], list[ClipChoice]]:
-    """Choose clips and long rollouts by an experiment's settings, on the way back of every episode.
+    """Choose clips and long rollouts by the settings, on the return path of every episode.
 
     Args:
-        config: gives the length of clips, ``data.context`` and ``evaluate``.
+        config: the clip length, ``data.context`` and ``evaluate`` are used.
         episodes: held-out episodes.
 
     Raises:
@@ -129,12 +129,12 @@ def choose_clips(
 
 
 def describe_shortened(config: Config, protocol: Protocol) -> str:
-    """Log that long rollouts are shorter than the settings ask, where they are; or ""."""
+    """Return a sentence if long rollouts are shorter than requested, else ""."""
     asked = config.evaluate.video_clips * (config.model.clip.frames - 1)
     if protocol.long_horizon >= asked:
         return ""
     return (
-        f"long rollouts have {protocol.long_horizon} frames, and not the {asked} of "
+        f"long rollouts have {protocol.long_horizon} frames instead of the {asked} of "
         "evaluate.video_clips: no walk of these data is long enough"
     )
 
@@ -148,21 +148,21 @@ def make_protocol(
     """Return the protocol of chosen clips and long rollouts.
 
     Args:
-        config: gives the size of pictures, ``data.context`` and ``evaluate``.
+        config: the image size, ``data.context`` and ``evaluate`` are used.
         episodes: held-out episodes.
-        clips: what is scored.
+        clips: the scored clips.
         rollouts: the long rollouts.
 
     Raises:
-        UserError: the episodes have other frames than the clip's.
+        UserError: the episodes have another image size than the clip's.
     """
     shape, keys, clip_keys = config.model.clip, [], {}
     for index in sorted({choice.episode for choice in (*clips, *rollouts)}):
         episode = episodes[index]
         if (episode.height, episode.width) != (shape.height, shape.width):
             raise UserError(
-                f"episode {episode.name} has frames of {episode.height}×{episode.width} and clips "
-                f"are of {shape.height}×{shape.width}: collect or import the data at that size."
+                f"episode {episode.name} has frames of {episode.height}×{episode.width} but clips "
+                f"need {shape.height}×{shape.width}: collect or import the data at that size."
             )
         for choice in (*clips, *rollouts):
             if choice.episode == index:
@@ -196,7 +196,7 @@ def content_hash(episode: Episode) -> str:
 
 
 def motion_hash(episode: Episode, choice: ClipChoice) -> str:
-    """Return the hash of a clip's motion, as it was recorded and before any arithmetic."""
+    """Return the hash of a clip's recorded motion, before any arithmetic."""
     poses = episode.world_from_camera[[choice.start, *choice.targets_N]]
     digest = hashlib.sha256(np.ascontiguousarray(poses, "<f4").tobytes())
     if episode.actions is not None:
@@ -208,32 +208,32 @@ def motion_hash(episode: Episode, choice: ClipChoice) -> str:
 def find_clips(
     protocol: Protocol, episodes: Sequence[Episode], where: str
 ) -> tuple[list[ClipChoice], list[ClipChoice]]:
-    """Find a protocol's clips in a data set; its episodes may lie in any order, among others.
+    """Find a protocol's clips in a data set, which may contain other episodes, in any order.
 
     Args:
-        protocol: what was chosen.
+        protocol: the protocol.
         episodes: the data set.
-        where: its name in messages.
+        where: its name in error messages.
 
     Returns:
         ``(clips, rollouts)``.
 
     Raises:
-        UserError: an episode is missing, or is not the same any more.
+        UserError: an episode is missing, or its content has changed.
     """
     wanted, found, names = {key.name for key in protocol.episodes}, {}, set()
     for index in range(len(episodes)):
         episode = episodes[index]
         names.add(episode.name)
-        if episode.name in wanted:  # the record holds its name, so no other can be the same
+        if episode.name in wanted:  # the record contains its name, so no other can be equal
             found[content_hash(episode)] = index
     for key in protocol.episodes:
         if key.sha256 not in found:
-            there = "holds another one of that name" if key.name in names else "does not hold it"
+            there = "has another one of that name" if key.name in names else "does not have it"
             raise UserError(
-                f"the protocol scores episode {key.name} (sha256 {key.sha256[:12]}…), and {where} "
-                f"{there}; name the folder of the protocol's data by --data and --split, or write "
-                "a protocol of this one."
+                f"the protocol scores episode {key.name} (sha256 {key.sha256[:12]}…), but {where} "
+                f"{there}; give the folder of the protocol's data by --data and --split, or write "
+                "a protocol for this one."
             )
 
     def choice(clip: ClipKey) -> ClipChoice:
@@ -247,13 +247,13 @@ def find_clips(
 def resolve_clips(
     config: Config, episodes: Sequence[Episode], fixed: Protocol | None, where: str
 ) -> tuple[Protocol, list[ClipChoice], list[ClipChoice]]:
-    """Return the protocol with its clips and long rollouts: those that are fixed, or chosen now.
+    """Return the protocol, its clips and its long rollouts: fixed, or chosen by the settings.
 
     Args:
-        config: the experiment, under the protocol that is fixed.
+        config: the experiment, with the settings of the fixed protocol.
         episodes: the data set.
-        fixed: a protocol that was chosen before, or None.
-        where: the data set's name in messages.
+        fixed: a protocol from a file, or None.
+        where: the data set's name in error messages.
 
     Raises:
         UserError: as ``find_clips``, ``choose_clips`` and ``make_protocol``.
@@ -265,7 +265,7 @@ def resolve_clips(
 
 
 def apply_protocol(protocol: Protocol, config: Config) -> Config:
-    """Return an experiment's settings with those that the protocol fixes in their place.
+    """Return an experiment's settings, with those fixed by the protocol replaced.
 
     Raises:
         UserError: the model's clips have another size, or do not fill the horizon.
@@ -273,14 +273,14 @@ def apply_protocol(protocol: Protocol, config: Config) -> Config:
     clip = config.model.clip
     if (clip.height, clip.width) != (protocol.height, protocol.width):
         raise UserError(
-            f"the protocol is of pictures of {protocol.height}×{protocol.width} and this model "
-            f"makes {clip.height}×{clip.width}: write a protocol of data of the model's size."
+            f"the protocol is for images of {protocol.height}×{protocol.width} but this model "
+            f"makes {clip.height}×{clip.width}: write a protocol for data of the model's size."
         )
     each = clip.frames - 1
     for horizon in (protocol.horizon, protocol.long_horizon):
         if horizon % each:
             raise UserError(
-                f"the protocol asks for {horizon} imagined frames and this model imagines {each} "
+                f"the protocol needs {horizon} imagined frames but this model imagines {each} "
                 f"at once: write a protocol whose horizon is a multiple of {each}."
             )
     evaluate = dataclasses.replace(
@@ -297,7 +297,7 @@ def apply_protocol(protocol: Protocol, config: Config) -> Config:
 
 
 def difference(one: Protocol, two: Protocol) -> str:
-    """Return in a few words what differs between two protocols; "" if nothing does."""
+    """Return a phrase with the first difference between two protocols; "" if there is none."""
     for field in dataclasses.fields(Protocol):
         first, second = getattr(one, field.name), getattr(two, field.name)
         if first == second:
@@ -316,26 +316,26 @@ def difference(one: Protocol, two: Protocol) -> str:
 
 FORMAT, FILE_VERSION = "pewm-protocol", 1
 OFF = "off"
-"""The setting that chooses clips by the settings, though the run names a file."""
+"""Value of ``--protocol`` that ignores the file in the run's settings."""
 FIXED = ("clips", "seeds", "chain", "stride", "video_clips")
-"""Settings of ``EvalConfig`` that a file stands above."""
+"""Settings of ``EvalConfig`` that a protocol file overrides."""
 
 
 def apply_protocol_file(
     config: Config, changes: Mapping[str, Any]
 ) -> tuple[Config, Protocol | None]:
-    """Return the settings under the protocol's file that they name, and what it holds.
+    """Return the settings with those of their protocol file applied, and the protocol.
 
     Args:
-        config: the run's, with overrides for the evaluation.
-        changes: those overrides; None is none.
+        config: the run's configuration, with overrides for the evaluation.
+        changes: these overrides; None values are ignored.
 
     Returns:
-        The settings as they are, and None, if they name no file.
+        The unchanged settings and None, if they name no file.
 
     Raises:
-        UserError: the file cannot be used, the model does not fit it, or an override says something
-            that it fixes.
+        UserError: the file cannot be used, the model does not fit it, or an override changes a
+            setting that it fixes.
     """
     name = config.evaluate.protocol
     if name in ("", OFF):
@@ -343,8 +343,8 @@ def apply_protocol_file(
     also = [f"--{key}" for key in FIXED if changes.get(key) is not None]
     if also:
         raise ConfigError(
-            f"{' and '.join(also)} cannot be chosen beside the protocol {name}, which fixes that: "
-            f"leave it out, or say --protocol {OFF}."
+            f"{' and '.join(also)} cannot be combined with the protocol {name}, which fixes it: "
+            f"omit it, or use --protocol {OFF}."
         )
     protocol = load_protocol(Path(name))
     config = apply_protocol(protocol, config)
@@ -357,16 +357,16 @@ def apply_protocol_file(
 def write_protocol(config: Config, path: Path, log: Callable[[str], Any]) -> Protocol:
     """Choose clips by an experiment's settings and write them to a file, before training.
 
-    A file that holds the same protocol is left as it is.
+    A file with the same protocol is not changed.
 
     Args:
-        config: gives the size and length of clips, ``data.path``, ``data.context`` and
-            ``evaluate``.
+        config: clip size and length, ``data.path``, ``data.context`` and
+            ``evaluate`` are used.
         path: the file.
-        log: shows a line.
+        log: prints a line.
 
     Raises:
-        UserError: the data are absent or too short, or the file holds another protocol.
+        UserError: the data are missing or too short, or the file contains another protocol.
     """
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
@@ -375,10 +375,10 @@ def write_protocol(config: Config, path: Path, log: Callable[[str], Any]) -> Pro
         other = difference(load_protocol(path), protocol)
         if other:
             raise UserError(
-                f"{path} holds another protocol ({other}): name another file by --out, or delete "
-                "it if nothing has been scored by it."
+                f"{path} contains another protocol ({other}): choose another file by --out, or "
+                "delete it if no run has been evaluated with it."
             )
-        log(f"{path} holds this protocol already")
+        log(f"{path} already contains this protocol")
     else:
         save_protocol(path, protocol, {"data": str(split)})
     scenes = {key.scene for key in protocol.episodes}
@@ -395,12 +395,12 @@ def write_protocol(config: Config, path: Path, log: Callable[[str], Any]) -> Pro
 
 
 def save_protocol(path: Path, protocol: Protocol, notes: dict[str, Any]) -> None:
-    """Write a protocol's file; its folder is made.
+    """Write a protocol file; its folder is created.
 
     Args:
         path: the file.
-        protocol: what was chosen.
-        notes: facts that are not hashed, such as where the data lie.
+        protocol: the protocol.
+        notes: notes that are not hashed, such as the location of the data.
     """
     value = {
         "format": FORMAT,
@@ -414,15 +414,15 @@ def save_protocol(path: Path, protocol: Protocol, notes: dict[str, Any]) -> None
 
 
 def load_protocol(path: Path) -> Protocol:
-    """Read a protocol's file.
+    """Read a protocol file.
 
     Raises:
-        UserError: it is absent, no protocol, of another version, or was changed since it was
+        UserError: it is missing, not a protocol, of another version, or was changed after it was
             written.
     """
-    if path.exists() and not path.is_file():  # a device may have no end
-        kind = "a folder" if path.is_dir() else "no regular file"
-        raise UserError(f"the protocol {path} is {kind}; name a file that ends in .json.")
+    if path.exists() and not path.is_file():  # a device file may be endless
+        kind = "a folder" if path.is_dir() else "not a regular file"
+        raise UserError(f"the protocol {path} is {kind}; give a file that ends in .json.")
     try:
         value = json.loads(path.read_text("utf-8"))
     except OSError as error:
@@ -434,18 +434,19 @@ def load_protocol(path: Path) -> Protocol:
         raise UserError(f"the protocol {path} is not JSON ({error}); write it again.") from None
     content = value.get("protocol") if isinstance(value, dict) else None
     if not isinstance(content, dict) or value.get("format") != FORMAT:
-        raise UserError(f"{path} is no protocol: write one with `pewm-jax protocol`.")
+        raise UserError(f"{path} is not a protocol: write one with `pewm-jax protocol`.")
     versions = value.get("version"), content.get("scoring")
     if versions != (FILE_VERSION, VERSION):
         raise UserError(
             f"the protocol {path} has versions {versions[0]} (file) and {versions[1]} (scoring), "
-            f"this library's are {FILE_VERSION} and {VERSION}; write it again, and score every run "
-            "by the new one."
+            f"this library's are {FILE_VERSION} and {VERSION}; write it again, and evaluate every "
+            "run "
+            "with the new one."
         )
     if hash_of(content) != value.get("sha256"):
         raise UserError(
-            f"the protocol {path} was changed after it was written: what it says is not what its "
-            "hash is of; write it again with `pewm-jax protocol`."
+            f"the protocol {path} was changed after it was written: its content does not match its "
+            "hash; write it again with `pewm-jax protocol`."
         )
     try:
         return _parse(content)

@@ -1,8 +1,8 @@
-"""The reprojection baseline: observed pixels, drawn for the present camera without a network.
+"""The reprojection baseline: observed pixels rendered from the present camera without a network.
 
-Every observed pixel becomes a coloured point in the world, a z-buffer draws the points for each
-frame to imagine, and holes are filled with the nearest pixel that was hit. Its settings are those
-that score best on the validation split; the evaluated split is not used to choose them.
+Every observed pixel becomes a coloured 3D point, a z-buffer renders the points for each frame to
+imagine, and holes are filled with the nearest hit pixel. Its settings are those that score best on
+the validation split; the evaluated split is not used to choose them.
 """
 
 from __future__ import annotations
@@ -33,16 +33,17 @@ from pewm_jax.types import Array, Camera, Clip, Frames, View
 
 @dataclasses.dataclass(frozen=True)
 class ReprojectSettings:
-    """How observed pixels are drawn."""
+    """Rendering settings of observed pixels."""
 
     footprint: int = 1
-    """Pixels that a point covers at most, across and down."""
+    """Largest size of a point, pixels in each direction."""
     width: float = 1.0
     """Width of a point, in pixels of the frame that observed it."""
     average: bool = True
-    """Show the mean of all that is at the front, shared bilinearly; else the nearest point."""
+    """Blend all points at the front bilinearly; otherwise show the nearest point."""
     backs: bool = True
-    """Show surfaces from behind too; else a back hides what lies behind it and is filled over."""
+    """Show surfaces from behind too; otherwise a back face hides what lies behind it and is
+    filled."""
 
     def __post_init__(self):
         """Validate."""
@@ -51,12 +52,12 @@ class ReprojectSettings:
 
     @property
     def name(self) -> str:
-        """The settings in a word, for names of files."""
+        """Return a short name of the settings, for file names."""
         how = "mean" if self.average else "nearest"
         return f"{how}-{self.footprint}px-{self.width:g}{'' if self.backs else '-fronts'}"
 
     def __str__(self) -> str:
-        """Log the settings for people."""
+        """Return a description of the settings."""
         size = "1 pixel each" if self.footprint == 1 else f"up to {self.footprint} pixels each"
         if self.footprint > 1 and self.width != 1:
             size += f", {self.width:g} observed pixels wide"
@@ -74,28 +75,28 @@ CANDIDATES = (
     ReprojectSettings(footprint=2, backs=False),
     ReprojectSettings(footprint=3, backs=False),
 )
-"""The settings that are tried on the validation split; the first is a plain z-buffer."""
+"""The candidates tried on the validation split; the first is a plain z-buffer."""
 
 
 def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> Frames:
-    """Draw what was observed for other cameras.
+    """Render observed frames from other cameras.
 
     Args:
-        settings: how (static under jit).
-        context: S observed frames, colours uint8 or float in [−1, 1]; pixels without depth do not
-            count, as those of frames that pad a context.
+        settings: rendering settings (static under jit).
+        context: S observed frames, colours uint8 or float in [−1, 1]; pixels without depth, such as
+            those of padding frames, are ignored.
         camera: (N,) cameras of images of the context's size.
 
     Returns:
-        N frames, colours float32 in [−1, 1], depth in metres. Where nothing was observed anywhere
-        in an image, it is black and has no depth.
+        N frames, colours float32 in [−1, 1], depth in metres. An image without any observed point
+        is black and has no depth.
     """
     view = views.fill_nearest(draw(settings, context, camera))
     return Frames(2 * view.features_THWF - 1, view.depth_THW, camera)
 
 
 def draw(settings: ReprojectSettings, context: Frames, camera: Camera) -> View:
-    """Return the same with its holes, colours in [0, 1]."""
+    """Return the rendering before holes are filled, colours in [0, 1]."""
     depth_SHW = jnp.asarray(context.depth_THW)
     height, width = depth_SHW.shape[1:]
     points = unproject(depth_SHW, context.camera).reshape(-1, 3)
@@ -122,7 +123,7 @@ def draw(settings: ReprojectSettings, context: Frames, camera: Camera) -> View:
 
 @functools.partial(jax.jit, static_argnums=0)
 def reproject_batch(settings: ReprojectSettings, context: Frames, camera: Camera) -> Frames:
-    """Do the same for B clips, one after the other: what one needs fits a processor's cache.
+    """Render B clips in sequence, because the data of one clip fits a CPU cache.
 
     Args:
         settings: as for ``reproject``.
@@ -139,21 +140,21 @@ def reproject_batch(settings: ReprojectSettings, context: Frames, camera: Camera
 
 
 SPLIT, CLIPS = "validation", 24
-"""The split that chooses, and the most clips that are cut from it."""
+"""The split that chooses the settings, and the largest number of clips cut from it."""
 VERSION = 1
-"""Increase it whenever the same data would give other scores."""
+"""Increase it whenever the same data would give different scores."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ReprojectChoice:
-    """The settings that are used, and why.
+    """The chosen settings, and the reason.
 
     Attributes:
-        settings: those chosen.
-        scores: the name of each candidate → mean PSNR over all pixels of the clips, decibels; empty
-            where nothing could be tried.
-        clips: how many clips they were tried on.
-        why: a sentence for people.
+        settings: the chosen settings.
+        scores: the name of each candidate → mean PSNR over all pixels of the clips, dB; empty if
+            none could be tried.
+        clips: number of clips they were tried on.
+        why: the reason, as a sentence.
         data: sha256 of the index of the validation split; "" if there is none.
     """
 
@@ -164,7 +165,7 @@ class ReprojectChoice:
     data: str = ""
 
     def facts(self) -> dict[str, Any]:
-        """Return what the report says of it."""
+        """Return the report's entry."""
         return {
             "split": SPLIT if self.scores else None,
             "dataset_sha256": self.data,
@@ -187,16 +188,16 @@ def data_hash(config: Config) -> str:
 def choose_settings(
     config: Config, cache: ResultCache, log: Callable[[str], Any]
 ) -> ReprojectChoice:
-    """Try all candidates on the data set's validation split and take the best.
+    """Try all candidates on the data set's validation split and choose the best.
 
     Clips are cut as in training, the same at every call: one from each episode, then a second one,
-    and so on. Scores are stored in ``cache``. Without a validation split whose clips fit
-    the model, the default settings are taken.
+    and so on. Scores are stored in ``cache``. Without a validation split whose clips fit the model,
+    the default settings are used.
 
     Args:
         config: the experiment.
         cache: where scores are stored.
-        log: shows a line.
+        log: prints a line.
     """
     folder, data = Path(config.data.path) / SPLIT, data_hash(config)
     try:
@@ -226,7 +227,7 @@ def choose_settings(
 
 
 def _piece(config: Config, data: str) -> str:
-    """Return the name of the stored scores, with all that they depend on."""
+    """Return the name of the stored scores, which includes all that they depend on."""
     content = [
         VERSION,
         data,
@@ -238,10 +239,10 @@ def _piece(config: Config, data: str) -> str:
 
 
 def _cut(config: Config, episodes: EpisodeSource) -> Clip:
-    """Cut at most ``CLIPS`` clips as training does, in a fixed order.
+    """Cut at most ``CLIPS`` clips as in training, in a fixed order.
 
     Raises:
-        UserError: there is none, or their frames have another size than the model's.
+        UserError: there is no clip, or the frames have another size than the model's.
     """
     rng, cut = np.random.default_rng(0), []
     size = (config.model.clip.height, config.model.clip.width)
@@ -255,12 +256,12 @@ def _cut(config: Config, episodes: EpisodeSource) -> Clip:
         choice = clips.choose(config, episode.length, rng, episode.name)
         cut.append(clips.cut(episode, choice, config.data.context))
     if not cut:
-        raise UserError(f"{episodes.path} has no episode; collect some.")
+        raise UserError(f"{episodes.path} has no episodes; collect some.")
     return clips.stack([dataclasses.replace(clip, actions_TA=None) for clip in cut])
 
 
 def _score(settings: ReprojectSettings, batch: Clip) -> float:
-    """Return the mean PSNR over clips, of all pixels of a clip together."""
+    """Return the mean over clips of the PSNR over all pixels of a clip."""
     targets = jax.tree.map(lambda x: x[:, 1:], batch.frames)
     frames = reproject_batch(settings, batch.context, targets.camera)
     everything = np.ones(targets.depth_THW.shape, bool)

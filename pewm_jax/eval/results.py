@@ -1,8 +1,8 @@
 """The results of an evaluation: the content of ``metrics.json`` and the scores of every clip.
 
 ``samples.npz`` stores the scores of every clip, so that any two runs can be compared clip by clip
-later. It holds an array for each of ``clips``, ``frames`` and ``rollouts``, each method, mask and
-metric, under a name such as ``clips/memory/seen/psnr``; NaN if a clip has no score. Its member
+later. It contains an array for each of ``clips``, ``frames`` and ``rollouts``, each method, mask
+and metric, under a name such as ``clips/memory/seen/psnr``; NaN if a clip has no score. Its member
 ``about`` is JSON. ``docs/evaluation.md`` describes both.
 """
 
@@ -35,7 +35,7 @@ from pewm_jax.report.labels import own_method
 
 SCHEMA = 1
 """Version of the layout of ``metrics.json``, which ``docs/evaluation.md`` describes. Entries may be
-added; increase it when one goes or comes to mean something else."""
+added; increase it when one is removed or changes its meaning."""
 
 
 def compute_metrics(
@@ -46,17 +46,17 @@ def compute_metrics(
     i3d: VideoDistance | None = None,
     consistency: Consistency | None = None,
 ) -> dict[str, Any]:
-    """Turn errors into the content of ``metrics.json``, except for hashes.
+    """Return the content of ``metrics.json``, except for hashes.
 
     Returns:
         ``schema``; ``protocol``; ``results[method][mask][metric] = {mean, stderr, n}``;
-        ``margins[method][mask][metric]``, the model minus that method, clip by clip, and
-        ``margin``, the one over ``empty`` (None of a model without a memory);
-        ``per_frame[method][mask][metric]``; ``long`` with the same of long rollouts,
-        ``drift[method]`` (see ``statistics.drift``) and ``growth``, what the map holds; ``houses``,
-        means over houses with 95 % intervals (see ``intervals.table``), with the same of long
-        rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, the mirror test (see
-        ``mirror.facts``); ``scs``, see ``structure``; None where something was not measured.
+        ``margins[method][mask][metric]``, the model minus that method, paired by clip, and
+        ``margin``, the one over ``empty`` (None for a model without a memory);
+        ``per_frame[method][mask][metric]``; ``long`` with the same for long rollouts,
+        ``drift[method]`` (see ``statistics.drift``) and ``growth``, the size of the map;
+        ``houses``, means over houses with 95 % intervals (see ``intervals.table``), with the same
+        for long rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, the mirror test (see
+        ``mirror.facts``); ``scs``, see ``structure``; None for what was not measured.
     """
     return {
         "schema": SCHEMA,
@@ -90,7 +90,7 @@ def _scores(scored: Scored) -> dict[str, Any]:
 
 
 def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
-    """Return how much the map holds along long rollouts, or None where there is none."""
+    """Return the size of the map along long rollouts, or None without a map."""
     held = long.kept.get("memory", {}).get("occupied")
     if held is None:
         return None
@@ -105,7 +105,7 @@ def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
 
 
 def structure(config: Config, scored: Scored, consistency: Consistency) -> dict[str, Any]:
-    """Return SCS of every method and its ceiling, over houses; ``docs/evaluation.md`` says more."""
+    """Return SCS of every method and its ceiling, over houses; see ``docs/evaluation.md``."""
 
     def entry(values: np.ndarray) -> dict[str, Any]:
         return intervals.entry(values, scored.clusters)
@@ -127,7 +127,7 @@ def structure(config: Config, scored: Scored, consistency: Consistency) -> dict[
 
 
 def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any] | None:
-    """Return FVD and KVD of every method with their floors; None of fewer than two clips."""
+    """Return FVD and KVD of every method with their floors; None for fewer than two clips."""
     features = dict(scored.features)
     truth, clips = features.pop(TRUTH), len(scored.choices)
     if clips < 2:
@@ -174,9 +174,9 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
         "starts": "spread evenly over the way back of every episode; no randomness",
         "observed": "context frames spread evenly over the episode's past, the present one last; "
         + (
-            "all go into the map, and the model also sees the present one itself"
+            "all are inserted into the map, and the model also sees the present one directly"
             if remembers
-            else "the model has no memory and sees the present one alone"
+            else "the model has no memory and sees only the present one"
         ),
         "motion": "the recorded one; poses integrated from actions agree with the recorded poses",
         "seen": "a pixel whose true point projects into an observed frame where the true depth "
@@ -225,13 +225,13 @@ def _version() -> str:
 
 SAMPLES, SAMPLES_VERSION = "samples.npz", 1
 PARTS = ("clips", "frames", "rollouts")
-"""Whole clips (seeds, clips); their frames, (seeds, clips, horizon); and the frames of long
-rollouts, (1, rollouts, long horizon)."""
+"""Parts of the scores: whole clips, (seeds, clips); their frames, (seeds, clips, horizon); and the
+frames of long rollouts, (1, rollouts, long horizon)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """What ``samples.npz`` holds.
+    """The content of ``samples.npz``.
 
     Attributes:
         about: ``version``, ``protocol_sha256``, ``weights_sha256``, ``lpips_weights_sha256``,
@@ -245,11 +245,11 @@ class Samples:
 
     @property
     def own(self) -> str:
-        """The method that is the model itself: ``memory``, or ``model`` if it has none."""
+        """Return the method of the model itself: ``memory``, or ``model`` if it has none."""
         return own_method(name.split("/")[1] for name in self.arrays)
 
     def table(self, part: str, method: str) -> dict[str, dict[str, np.ndarray]]:
-        """Return ``[mask][metric]`` of one of ``PARTS``; empty where there is no such method."""
+        """Return ``[mask][metric]`` of one of ``PARTS``; empty if there is no such method."""
         found: dict[str, dict[str, np.ndarray]] = {}
         for name, array in self.arrays.items():
             where, whose, mask, metric = name.split("/")
@@ -268,7 +268,7 @@ def gather_samples(scored: Scored, long: LongRollouts, **facts: Any) -> Samples:
 
     Args:
         scored: errors of the clips.
-        long: the same of long rollouts.
+        long: errors of the long rollouts.
         facts: the hashes and seeds of ``Samples.about``.
     """
     arrays = {}
@@ -309,10 +309,10 @@ def load_samples(folder: Path) -> Samples:
     """Read ``samples.npz`` of a report's folder.
 
     Raises:
-        UserError: it is absent, damaged, or of another version.
+        UserError: it is missing, damaged, or of another version.
     """
     path = folder / SAMPLES
-    again = "score the run again with `pewm-jax evaluate`; finished scores are reused"
+    again = "evaluate the run again with `pewm-jax evaluate`; finished scores are reused"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
             arrays = {name: found[name] for name in found.files}

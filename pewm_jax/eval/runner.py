@@ -4,8 +4,8 @@
 memory        the model with its map
 empty         the same weights with an empty map
 model         instead of both, a model that was trained without a memory
-none          another model, trained for as many steps without a memory (if one is given)
-reproject     no network: what was observed, moved to the present camera
+none          another model, trained for as many steps without a memory (optional)
+reproject     no network: observed pixels, rendered from the present camera
 copy          no network: the last observed frame, repeated
 ============= ====================================================================================
 
@@ -38,7 +38,7 @@ from pewm_jax.worlds.rollouts import rollout
 
 
 def workers() -> Workers:
-    """Return the processes of this job, which share the work of an evaluation."""
+    """Return the processes of this job, among which an evaluation's work is divided."""
     return Workers(
         jax.process_count(),
         jax.process_index(),
@@ -52,17 +52,17 @@ def print_now(line: str) -> None:
 
 
 class ModelRunner:
-    """A model that imagines batches of clips of one size; functions are compiled when first needed.
+    """Imagines batches of clips of one size with a model; functions are compiled on first use.
 
     Args:
-        config: static.
+        config: the experiment (static).
         params: weights.
-        batch: clips sampled at once.
-        context: number of observed frames that a state starts from.
+        batch: number of clips sampled at once.
+        context: number of observed frames from which a state is started.
         cameras: whether clips are driven by cameras (six degrees of freedom) instead of actions.
-        devices: of this process, which each imagine an equal part of a batch, as many of them as
-            divide it; by default one.
-        log: shows a line: what is being compiled, and how long it took.
+        devices: devices of this process, over which a batch is split, as many of them as divide it;
+            by default one.
+        log: prints what is being compiled, and how long it took.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class ModelRunner:
     def prepare(self, memories: Iterable[bool]) -> None:
         """Compile ``start``, and the sampler with (True) or without (False) its map.
 
-        Nothing is compiled twice, and nothing if no variant is given.
+        Nothing is compiled twice, and nothing if ``memories`` is empty.
         """
         memories = [memory for memory in memories if memory not in self._clip]
         if not memories:
@@ -117,7 +117,7 @@ class ModelRunner:
             )
 
     def begin(self, context: Frames) -> WorldState:
-        """Return the states that (B, S) observed frames lead to."""
+        """Return the states after (B, S) observed frames."""
         return self._prepare_start()(self.params, self._put(context))
 
     def run(
@@ -134,13 +134,13 @@ class ModelRunner:
 
         Args:
             context: (B, S) observed frames, the present last, colours uint8.
-            control: the way from the present frame through the N frames: (B, N, 3) actions, or
-                (B, N) cameras.
-            seeds_B2: sampling seed and clip number; equal numbers give equal noise, in any batch,
+            control: from the present frame through the N frames: (B, N, 3) actions, or (B, N)
+                cameras.
+            seeds_B2: sampling seed and clip number; equal values give equal noise, in any batch,
                 with or without the map.
             memory: whether to use the map or an empty one.
             params: other weights of the same shapes.
-            watch: is given the states at the start and after every clip.
+            watch: called with the states at the start and after every clip.
 
         Returns:
             ``(first, last, frames)``: the state before, the state after, (B, N) NumPy frames.
@@ -177,7 +177,7 @@ class ModelRunner:
         return begin
 
     def _split(self, function: Callable, batched: int) -> Callable:
-        """Return a function of weights and batches that each device calls with a part of them."""
+        """Return a function of weights and batches that is sharded over the devices."""
         if self.mesh is None:
             return function
         parts = (P(), *[P("clips")] * batched)
@@ -186,7 +186,7 @@ class ModelRunner:
         )
 
     def _placed(self, tree: Any) -> Any:
-        """Return shapes of batches with the devices that they are on."""
+        """Return abstract batches with their shardings."""
         if self.mesh is None:
             return tree
         where = NamedSharding(self.mesh, P("clips"))
@@ -199,7 +199,7 @@ class ModelRunner:
         return jax.device_put(tree, NamedSharding(self.mesh, P("clips"))) if self.mesh else tree
 
     def _everywhere(self, params: Params) -> Params:
-        """Put weights on every device."""
+        """Replicate weights on every device."""
         if self.mesh is None:
             return jax.tree.map(jnp.asarray, params)
         return jax.device_put(params, NamedSharding(self.mesh, P()))
@@ -213,11 +213,11 @@ class ModelRunner:
 
 
 def mesh_of(devices: Sequence[Any], batch: int) -> Mesh | None:
-    """Return the devices that a batch is split over, or None for the one that JAX takes.
+    """Return the mesh over which a batch is split, or None for JAX's default device.
 
     Args:
-        devices: of this process.
-        batch: clips; each device gets as many, so some may be left out.
+        devices: devices of this process.
+        batch: number of clips; split equally, so some devices may be unused.
     """
     count = max((n for n in range(1, len(devices) + 1) if batch % n == 0), default=1)
     if count < 2:
@@ -226,12 +226,12 @@ def mesh_of(devices: Sequence[Any], batch: int) -> Mesh | None:
 
 
 def clip_keys(seeds_B2: Array) -> Array:
-    """Return one random key per clip from (B, 2) integers: sampling seed, clip number."""
+    """Return one PRNG key per clip from (B, 2) integers: sampling seed, clip number."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed[0]), seed[1]))(seeds_B2)
 
 
 def copy_last(context: Frames, count: int) -> Frames:
-    """Repeat the present frame of every clip: the baseline that nothing changes."""
+    """Repeat the present frame of every clip: the baseline in which nothing changes."""
     return jax.tree.map(lambda array: np.repeat(np.asarray(array)[:, -1:], count, 1), context)
 
 
@@ -246,7 +246,7 @@ def _compile(name: str, function: Callable, arguments: tuple, log: Callable[[str
 METHODS = ("memory", "empty", "model", "none", "reproject", "copy")
 """All methods, in the order of the tables."""
 SAMPLED = ("memory", "empty", "model", "none")
-"""Those that draw noise, and so are scored with every seed."""
+"""Methods that sample noise, and so are scored with every seed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,11 +254,11 @@ class Methods:
     """The methods of one evaluation.
 
     Attributes:
-        model: the model that is scored.
+        model: the evaluated model.
         reproject: settings of the reprojection.
         none: a model trained without a memory, or None.
-        none_weights: hash of its weights.
-        remembers: whether the model that is scored has a memory.
+        none_weights: hash of the weights of ``none``.
+        remembers: whether the evaluated model has a memory.
     """
 
     model: ModelRunner
@@ -269,18 +269,18 @@ class Methods:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The available methods."""
+        """Return the available methods."""
         left_out = {"model"} if self.remembers else {"memory", "empty"}
         left_out |= {"none"} if self.none is None else set()
         return tuple(name for name in METHODS if name not in left_out)
 
     @property
     def own(self) -> str:
-        """The method that is the model itself: ``memory``, or ``model`` if it has none."""
+        """Return the method of the model itself: ``memory``, or ``model`` if it has none."""
         return "memory" if self.remembers else "model"
 
     def piece(self, method: str) -> str:
-        """Return the method's name in partial results: with all that only its scores depend on."""
+        """Return the method's name in partial results, which includes what its scores depend on."""
         extra = {"none": self.none_weights[:16], "reproject": self.reproject.name}
         return "-".join(filter(None, (method, extra.get(method))))
 
@@ -289,7 +289,7 @@ class Methods:
         return seeds if method in SAMPLED else (0,)
 
     def prepare(self, methods: Iterable[str]) -> None:
-        """Compile what some methods need."""
+        """Compile the functions of some methods."""
         methods = set(methods)
         known = ("empty", "memory", "model")
         self.model.prepare([name in OWN_METHODS for name in known if name in methods])
@@ -310,14 +310,14 @@ class Methods:
         Args:
             method: one of ``names``.
             context: (B, S) observed frames, the present last, colours uint8.
-            control: what drives the model, see ``ModelRunner.run``.
-            camera: (B, N) the cameras of the frames to imagine, where the control leads.
+            control: control of the model, see ``ModelRunner.run``.
+            camera: (B, N) cameras of the frames to imagine, according to the control.
             seeds_B2: sampling seed and clip number.
-            watch: of a network, see ``ModelRunner.run``.
+            watch: for networks, see ``ModelRunner.run``.
 
         Returns:
-            ``(first, last, frames)``: the states before and after, None without a network, and
-            (B, N) frames.
+            ``(first, last, frames)``: the states before and after, None for methods without a
+            network, and (B, N) frames.
 
         Raises:
             UserError: the model's output is not finite.

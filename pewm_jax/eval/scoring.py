@@ -1,7 +1,7 @@
-"""Scoring: imagine every chosen clip with every method and sum the errors; can be resumed.
+"""Scoring: imagine every chosen clip with every method and sum the errors; resumable.
 
-Every piece of work is one batch of clips, one method and one sampling seed. Its result is a file of
-the ``ResultCache``, and several processes share the pieces.
+A unit of work is one batch of clips, one method and one sampling seed. Its result is a file of the
+``ResultCache``, and several processes share the units.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from pewm_jax.eval.metrics.structure import (
     Consistency,
     average,
     first_visible,
+    object_ids,
     object_masks,
-    things_of,
 )
 from pewm_jax.eval.runner import SAMPLED, Methods, print_now, workers
 from pewm_jax.eval.seen import seen_masks_batch
@@ -32,7 +32,7 @@ from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.types import Array, Frames
 
 TRUTH = "truth"
-"""The recorded clips, which are measured like a method."""
+"""Pseudo-method for the recorded clips, which are measured like a method."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,11 +41,12 @@ class Scored:
 
     Attributes:
         choices: the C clips.
-        sums: method → (seeds, C, N, 3, 9) as ``images.error_sums``; one seed without a network.
-        features: where video distances are measured, method → (C, 400) features of the clips of
-            the first seed (``metrics.videos``), and those of ``truth``.
-        structure: where SCS is measured, method → (C, 1 + N): SCS of each clip of the first seed
-            and of each imagined frame, NaN where nothing counts, and the ceiling of ``truth``.
+        sums: method → (seeds, C, N, 3, 9) as ``images.error_sums``; one seed for methods without a
+            network.
+        features: if video distances are measured, method → (C, 400) features of the clips of the
+            first seed (``metrics.videos``), including ``truth``.
+        structure: if SCS is measured, method → (C, 1 + N): SCS of each clip of the first seed and
+            of each imagined frame, NaN where nothing counts; the entry ``truth`` is the ceiling.
     """
 
     choices: list[ClipChoice]
@@ -55,23 +56,23 @@ class Scored:
 
     @property
     def clustered_by(self) -> str:
-        """How standard errors are clustered: ``scene``, or ``episode`` if there is one scene."""
+        """Return the unit of clustering: ``scene``, or ``episode`` if there is one scene."""
         return "scene" if len({choice.scene for choice in self.choices}) > 1 else "episode"
 
     @property
     def clusters(self) -> np.ndarray:
-        """(C,) the cluster number of every clip; clips of one cluster show the same rooms."""
+        """Return the (C,) cluster index of every clip; clips of one cluster show the same rooms."""
         names = [getattr(choice, self.clustered_by) for choice in self.choices]
         return np.unique(names, return_inverse=True)[1]
 
 
 @dataclasses.dataclass(frozen=True)
 class Tracked:
-    """What SCS needs of a true clip.
+    """Ground truth of a clip for SCS.
 
     Attributes:
         ids_THW: (T, H, W) instance ids of the present frame and the N frames to imagine.
-        things: ids of the things that may be followed, or None for all.
+        things: ids of the objects that may be tracked, or None for all.
         visible_T: (T,) bool, whether each frame shows a point that the present frame shows.
     """
 
@@ -80,7 +81,7 @@ class Tracked:
     visible_T: np.ndarray
 
     def score(self, measure: Consistency, video_THWC: np.ndarray) -> np.ndarray:
-        """Return (T,) SCS of a clip, and of each of its frames but the first.
+        """Return (T,) values: SCS of a clip, then of each of its frames but the first.
 
         Args:
             measure: SCS with a segmenter.
@@ -92,10 +93,10 @@ class Tracked:
 
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Clips, padded to one size by repeating the last; ``real`` of them are not padding.
+    """Clips, padded to a fixed size by repeating the last; the first ``real`` are not padding.
 
-    ``described`` caches the features of LPIPS of their truth. ``tracked`` holds what SCS needs, if
-    it is measured.
+    ``described`` caches the LPIPS features of their ground truth. ``tracked`` contains the ground
+    truth for SCS, if it is measured.
     """
 
     context: Frames
@@ -109,7 +110,7 @@ class Batch:
     tracked: tuple[Tracked, ...] = ()
 
     def seeds(self, seed: int) -> np.ndarray:
-        """Return (B, 2) what the sampler's noise is drawn from: sampling seed, clip number."""
+        """Return (B, 2) sampling seed and clip number, which determine the sampler's noise."""
         return np.stack([np.full_like(self.numbers_B, seed), self.numbers_B], -1)
 
     def imagine(
@@ -124,7 +125,7 @@ class Batch:
         return methods.imagine(method, self.context, self.control, camera, seeds, watch)
 
     def whole(self, rgb_BTHWC: Any) -> Array:
-        """Return colours in [−1, 1] with the present frame before them, of padded clips too."""
+        """Return colours in [−1, 1], preceded by the present frame, including padding clips."""
         parts = self.context.rgb_THWC[:, -1:], rgb_BTHWC
         return jnp.concatenate([2 * unit_colours(part) - 1 for part in parts], 1)
 
@@ -136,7 +137,7 @@ class Batch:
         return np.stack([tracked.score(measure, video) for tracked, video in pairs])
 
     def sums(self, frames: Frames, lpips: LPIPS | None) -> np.ndarray:
-        """Return ``images.error_sums`` of the clips, with LPIPS if it is given."""
+        """Return ``images.error_sums`` of the clips, with LPIPS unless it is None."""
         sums = np.asarray(error_sums_batch(frames, self.targets, self.seen, self.unseen))
         if lpips is not None:
             known = lpips.net, lpips.sha256
@@ -155,18 +156,18 @@ def load_batch(
     cameras: bool,
     track: bool = False,
 ) -> Batch:
-    """Read clips, the first of them number ``first``, and find what was seen before.
+    """Read a batch of clips starting at index ``first``, with their seen-before masks.
 
     Args:
         config: the experiment.
         episodes: held-out episodes.
         choices: the clips.
-        first: number of the first of them.
+        first: index of the first clip.
         cameras: see ``load_clip``.
         track: whether to read the instance ids, for SCS.
 
     Raises:
-        UserError: see ``load_clip``; or ids are asked for and an episode has none.
+        UserError: see ``load_clip``; or ids are requested and an episode has none.
     """
     size = config.evaluate.batch
     parts = [load_clip(config, episodes, choice, cameras=cameras) for choice in choices]
@@ -183,17 +184,17 @@ def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
     frames = [choice.start, *choice.targets_N]
     clip = episode.frames(frames)
     visible_T = first_visible(np.asarray(clip.depth_THW), clip.camera)
-    return Tracked(episode.ids(frames), things_of(episode.info), visible_T)
+    return Tracked(episode.ids(frames), object_ids(episode.info), visible_T)
 
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """A piece of the table: one batch of clips, one method, one seed, and what is measured.
+    """A unit of work: one batch of clips, one method, one seed, one kind of measurement.
 
     Attributes:
         method: one of ``Methods.names``, or ``truth``.
-        seed: of the sampling noise.
-        first: number of the batch's first clip.
+        seed: seed of the sampling noise.
+        first: index of the batch's first clip.
         measured: ``sums`` of the errors, ``features`` for the distances of videos, or ``structure``
             for SCS.
     """
@@ -205,13 +206,13 @@ class Piece:
 
     @property
     def rollout(self) -> tuple[int, str, int]:
-        """The imagined clips that it measures; pieces of one rollout are computed together."""
+        """Return the key of the imagined clips; pieces with equal keys are computed together."""
         return self.first, self.method, self.seed
 
     def name(
         self, methods: Methods, i3d: VideoDistance | None, structure: Consistency | None = None
     ) -> str:
-        """Return the name of its file, with all that the result depends on beside the clips."""
+        """Return the file name, which includes all that the result depends on besides the clips."""
         who = "truth" if self.method == TRUTH else methods.piece(self.method)
         kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.measured == "features" else "table"
         if structure and self.measured == "structure":
@@ -230,7 +231,7 @@ def score_table(
     i3d: VideoDistance | None = None,
     structure: Consistency | None = None,
 ) -> Scored:
-    """Score ``evaluate.clips`` choices, chains of ``evaluate.chain`` clips, by method and seed.
+    """Score ``evaluate.clips`` chains of ``evaluate.chain`` clips by method and seed.
 
     Results in ``cache`` are reused. Several processes share the work, and all return the whole
     table.
@@ -238,13 +239,13 @@ def score_table(
     Args:
         config: the experiment.
         episodes: held-out episodes.
-        methods: who imagines.
+        methods: the methods.
         cache: where results are stored.
-        log: shows a line.
-        lpips: LPIPS; None leaves it out.
+        log: prints a line.
+        lpips: LPIPS; None to skip it.
         choices: the clips; by default those of ``choose``.
-        i3d: the network of FVD; None leaves out the features of whole clips.
-        structure: SCS; None leaves it out.
+        i3d: the network of FVD; None to skip the features of whole clips.
+        structure: SCS; None to skip it.
 
     Raises:
         UserError: no episode is long enough, the data is inconsistent or does not fit the model,
@@ -307,7 +308,7 @@ def score_table(
 def _pieces(
     config: Config, methods: Methods, starts: Sequence[int], extras: Sequence[str]
 ) -> list[Piece]:
-    """Return all pieces; those of one batch, and of one rollout, follow one another."""
+    """Return all pieces; those of one batch and of one rollout are adjacent."""
     pieces = []
     for first in starts:
         for method in methods.names:

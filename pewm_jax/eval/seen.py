@@ -1,7 +1,7 @@
 """Seen-before masks: which pixels of a frame show surfaces that earlier frames have seen.
 
-The masks are exact up to the sampling of the images: a pixel's true point in space is projected
-into each earlier frame and compared with that frame's true depth. No network is involved.
+The masks are exact up to the sampling of the images: a pixel's true 3D point is projected into each
+earlier frame and compared with that frame's true depth. No network is involved.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ def _agrees(depth_P: Array, z_P: Array) -> Array:
 
 
 def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array:
-    """Tell which points a depth image shows.
+    """Return which points are visible in a depth image.
 
-    A point is shown if it projects inside the image, in front of the camera, and its depth agrees
+    A point is visible if it projects inside the image, in front of the camera, and its depth agrees
     with the image there: either with the nearest pixel, or with 1/depth interpolated between the
-    four pixels around it. (On a plane 1/depth is linear in the image. So a floor seen at a grazing
-    angle is recognised, although its depth changes by more than the tolerance from row to row.)
+    four surrounding pixels. (On a plane 1/depth is linear in the image. So a floor seen at a
+    grazing angle is recognised, although its depth changes by more than the tolerance from row to
+    row.)
 
     Args:
         points_world_P3: (P, 3) points in the world, metres.
@@ -42,7 +43,7 @@ def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array
     u, v = uv[:, 0], uv[:, 1]
     inside = (z > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
 
-    # Once to the memory for all four pixels around a point, of which the nearest is one.
+    # One gather for the four pixels around a point, which include the nearest.
     padded = jnp.pad(depth_HW, 1, mode="edge")
     four = [padded[i : i + height + 1, j : j + width + 1] for i in (0, 1) for j in (0, 1)]
     left, top = jnp.floor(u - 0.5), jnp.floor(v - 0.5)
@@ -62,7 +63,7 @@ def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array
 
 
 def seen_masks(target: Frames, context: Frames) -> tuple[Array, Array]:
-    """Split the pixels of frames into seen before and never seen.
+    """Return masks of the pixels seen before and never seen.
 
     Args:
         target: T frames with true depth and poses.

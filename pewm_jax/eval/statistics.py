@@ -18,16 +18,17 @@ from pewm_jax.eval.metrics.images import MASKS, PSNR_CEILING, SUMS
 from pewm_jax.report.labels import own_method
 
 METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
-"""dB; structural similarity; metres; share of the true depth. Under the mask ``all`` there is also
-``lpips`` where it was measured."""
+"""Units: dB; structural similarity; metres; share of the true depth. Under the mask ``all`` there
+is also ``lpips`` if it was measured."""
 ENDS = 16
-"""Frames at the start and at the end of a long rollout that are compared to tell its drift."""
+"""Number of frames at the start and at the end of a long rollout that are compared to measure
+drift."""
 LEAST_SHARE = 0.01
-"""The smallest share of pixels that a mask must cover for a clip or frame to get a score."""
+"""Smallest share of pixels that a mask must cover for a clip or frame to get a score."""
 
 
 def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-    """Turn sums into scores.
+    """Convert sums to scores.
 
     Args:
         sums: (..., 3, 9) from ``error_sums``, possibly summed over frames.
@@ -62,7 +63,7 @@ def summary(values: np.ndarray, clusters: np.ndarray) -> dict[str, Any]:
     """Return the average over clips and its standard error.
 
     Args:
-        values: (clips,) one number per clip, NaN if a clip has no score.
+        values: (clips,) one value per clip, NaN if a clip has no score.
         clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
@@ -105,11 +106,11 @@ def table(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any
 
 
 def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[str, Any]:
-    """Compare two methods clip by clip: the same clips, seeds and noise.
+    """Compare two methods on the same clips, seeds and noise.
 
     Args:
         better: (seeds, clips, T, 3, 9) sums of the first method.
-        base: the same of the second.
+        base: sums of the second method.
         clusters: (clips,) the scene (or episode) each clip comes from.
 
     Returns:
@@ -138,7 +139,7 @@ def margin(better: np.ndarray, base: np.ndarray, clusters: np.ndarray) -> dict[s
 
 
 def margins(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
-    """Compare the model itself (``own_method``) with every other method, as ``margin`` does."""
+    """Compare the model itself (``own_method``) with every other method; see ``margin``."""
     own = own_method(sums)
     return {
         method: margin(sums[own], other, clusters)
@@ -148,7 +149,7 @@ def margins(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, A
 
 
 def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
-    """Tell how PSNR over pixels seen before changes along long rollouts.
+    """Return how PSNR over pixels seen before changes along long rollouts.
 
     Args:
         sums: method → (seeds, rollouts, N, 3, 9).
@@ -156,8 +157,8 @@ def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any
 
     Returns:
         ``[method]``: ``quarters``, the scores of the four quarters of the frames; and ``first16``,
-        ``last16`` and ``difference``, the last 16 frames minus the first rollout by rollout, or
-        None where a rollout has fewer than 32 frames. Each is ``{mean, stderr, n}``.
+        ``last16`` and ``difference``, the last 16 frames minus the first 16, paired by rollout, or
+        None if a rollout has fewer than 32 frames. Each is ``{mean, stderr, n}``.
     """
 
     def of(sums_SCT39: np.ndarray) -> np.ndarray:
@@ -176,7 +177,7 @@ def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any
 
 
 def per_frame(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
-    """Score every frame index on its own.
+    """Score every frame index separately.
 
     Args:
         sums: method → (seeds, clips, T, 3, 9).

@@ -1,12 +1,12 @@
-"""Measure whether actions steer a world: imagine walks with the true actions, other ones and none.
+"""Measure whether actions steer a world: imagine walks with true, shuffled and no actions.
 
-A world that follows its actions is nearest to the truth with the true ones. *Shuffled* actions are
-those of a clip in another house. *None* are embeddings of zero, which observed frames have: only a
-model whose control modulates can be asked for that. *Copy* is a baseline without a network, which
+A world that follows its actions is closest to the ground truth with the true ones. *Shuffled*
+actions are those of a clip in another house. *None* are zero embeddings, as observed frames have:
+available only for models whose control uses modulation. *Copy* is a baseline without a network that
 repeats the observed frame.
 
 The measurement needs clips that can show a difference (``Walks``). In every clip at least half of
-the steps go forward, since a turn on the spot replaces the whole view after a few frames, whatever
+the steps go forward, because a turn in place replaces the whole view after a few frames, whatever
 the actions are. The shuffled actions differ from the true ones in at least half of the steps.
 """
 
@@ -25,7 +25,7 @@ from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import intervals
-from pewm_jax.eval.clips import ClipChoice, choice_of, load_clip, stack, way_back
+from pewm_jax.eval.clips import ClipChoice, choice_of, load_clip, return_start, stack
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.runner import workers
 from pewm_jax.geometry.actions import actions_between
@@ -39,24 +39,25 @@ LEAST_FORWARD = 0.5
 LEAST_DIFFERENT = 0.5
 """Smallest share of a clip's steps in which the shuffled actions differ from the true ones."""
 MOVED = 0.1
-"""Motion ahead, in steps of ``ActionConfig.step_m``, up to which the agent stands still."""
+"""Forward motion, in steps of ``ActionConfig.step_m``, up to which the agent counts as standing
+still."""
 APART = 0.5
-"""Difference between two motions, in units of a step or a turn, from which on they differ."""
+"""Smallest difference between two motions that counts, in units of a step or a turn."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Walks:
-    """Clips that are walks, each with a clip of another house whose actions are other ones.
+    """Clips that are walks, each with a clip of another house that has different actions.
 
     Attributes:
         choices: the C clips to imagine.
-        others: (C,) clips whose actions are the shuffled ones.
+        others: (C,) clips that provide the shuffled actions.
         forward_C: (C,) share of each clip's steps that go forward, at least ``LEAST_FORWARD``.
         different_C: (C,) share of the steps in which the shuffled actions differ from the true
             ones, at least ``LEAST_DIFFERENT``.
 
     Raises:
-        ValueError: a share is below its limit, or both clips of a pair are of one house.
+        ValueError: a share is below its limit, or both clips of a pair are from one house.
     """
 
     choices: list[ClipChoice]
@@ -65,12 +66,12 @@ class Walks:
     different_C: np.ndarray
 
     def __post_init__(self):
-        """Check the properties on which the measurement rests."""
+        """Check the properties on which the measurement relies."""
         pairs = zip(self.choices, self.others, strict=True)
         if any(one.scene == other.scene for one, other in pairs):
-            raise ValueError("the actions of a clip are shuffled with those of its own house")
+            raise ValueError("the shuffled actions of a clip come from its own house")
         if np.any(self.forward_C < LEAST_FORWARD):
-            raise ValueError(f"a clip with {self.forward_C.min():.0%} forward steps is no walk")
+            raise ValueError(f"a clip with {self.forward_C.min():.0%} forward steps is not a walk")
         if np.any(self.different_C < LEAST_DIFFERENT):
             raise ValueError(
                 f"shuffled actions differ in {self.different_C.min():.0%} of the steps"
@@ -78,12 +79,12 @@ class Walks:
 
     @property
     def houses(self) -> np.ndarray:
-        """(C,) the number of each clip's house."""
+        """Return the (C,) index of each clip's house."""
         return np.unique([choice.scene for choice in self.choices], return_inverse=True)[1]
 
     @property
     def about(self) -> str:
-        """What the clips are, in a sentence."""
+        """Return a description of the clips."""
         return (
             f"{len(self.choices)} walks in {len(set(self.houses))} houses: "
             f"{100 * self.forward_C.mean():.1f} % of the steps go forward (in each clip at least "
@@ -129,24 +130,25 @@ def choose_walks(
     chain: int = 1,
     among: Iterable[int] | None = None,
 ) -> Walks:
-    """Choose clips that are walks, and the clips whose actions are the shuffled ones.
+    """Choose clips that are walks, and the clips that provide the shuffled actions.
 
-    Starts are spread evenly over the walks on the way back of every episode, where reports take
-    their clips too. The shuffled actions are drawn, with a fixed seed, from all clips on the way
-    back in other houses that differ in ``LEAST_DIFFERENT`` of the steps; they need not be walks.
+    Starts are spread evenly over the walks on the return path of every episode, where reports take
+    their clips too. The shuffled actions are drawn, with a fixed seed, from all clips on the return
+    paths in other houses that differ in ``LEAST_DIFFERENT`` of the steps; these need not be walks.
 
     Args:
-        config: gives ``clip.frames``, ``actions``, ``data.context`` and ``evaluate.stride``.
+        config: ``clip.frames``, ``actions``, ``data.context`` and ``evaluate.stride`` are used.
         episodes: held-out episodes.
-        clips: the most clips to choose.
-        chain: clips generated one after the other from each start.
+        clips: largest number of clips.
+        chain: number of consecutive clips from each start.
         among: indices of the episodes to choose from; by default all.
 
     Returns:
         The first walk of every episode, then the second ones, and so on.
 
     Raises:
-        UserError: no episode is long enough, none has a walk, or no other house has other actions.
+        UserError: no episode is long enough, none has a walk, or no other house has different
+            actions.
     """
     units, stride = config.model.actions, config.evaluate.stride
     count = chain * (config.model.clip.frames - 1)
@@ -161,7 +163,7 @@ def choose_walks(
         last = episode.length - 1 - count * stride
         if last < 0:
             continue
-        starts = np.arange(min(way_back(episode), last), last + 1)
+        starts = np.arange(min(return_start(episode), last), last + 1)
         steps_SN = starts[:, None] + stride * np.arange(count)
         motion_SN3 = _motion(episode.world_from_camera, stride)[steps_SN]
         walking = np.flatnonzero(forward_steps(units, motion_SN3).mean(1) >= LEAST_FORWARD)
@@ -179,7 +181,7 @@ def choose_walks(
     if not ranked:
         raise UserError(
             f"no clip of {where} is a walk: in each of them fewer than half of the steps go "
-            "forward; collect walks with --test_policy follow, or score another split "
+            "forward; collect walks with --test_policy follow, or evaluate another split "
             "(evaluate.split)."
         )
     motion_PN3 = np.concatenate(motions)
@@ -195,8 +197,8 @@ def choose_walks(
             different.append(share_P[other])
     if not chosen:
         raise UserError(
-            f"no clip of {where} can be given other actions: they come from another house and "
-            "differ in at least half of the steps; score a split with several houses "
+            f"no clip of {where} has a partner with different actions: it must be from another "
+            "house and differ in at least half of the steps; evaluate a split with several houses "
             "(evaluate.split)."
         )
     return Walks(
@@ -215,10 +217,10 @@ def _motion(world_from_camera: np.ndarray, stride: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Steered:
-    """What was measured.
+    """The results of the measurement.
 
     Attributes:
-        errors: by kind of actions, (C, N) mean squared errors of each imagined frame's colours.
+        errors: kind of actions → (C, N) mean squared colour errors of each imagined frame.
         walks: the C clips.
     """
 
@@ -227,19 +229,19 @@ class Steered:
 
     @property
     def psnr(self) -> dict[str, np.ndarray]:
-        """PSNR of each clip, by kind of actions, dB."""
+        """Return the PSNR of each clip in dB, by kind of actions."""
         return {name: np.asarray(psnr(each.mean(1))) for name, each in self.errors.items()}
 
     def table(self) -> dict[str, dict[str, Any]]:
-        """Return means over houses with intervals, and how much better the true actions are."""
+        """Return means over houses with intervals, and the margins of the true actions."""
         return self._entries(self.psnr)
 
     def per_frame(self) -> dict[str, dict[str, Any]]:
-        """Return the same with a list over imagined frames in the place of each number."""
+        """Return ``table`` with a list over imagined frames in place of each number."""
         return self._entries({name: np.asarray(psnr(x)) for name, x in self.errors.items()})
 
     def facts(self) -> dict[str, Any]:
-        """Return the numbers for ``metrics.json``; ``docs/evaluation.md`` describes them."""
+        """Return the results for ``metrics.json``; ``docs/evaluation.md`` describes them."""
         return {
             "clips": len(self.walks.choices),
             "forward": float(self.walks.forward_C.mean()),
@@ -273,14 +275,14 @@ def measure(
     """Imagine walks with true, shuffled and no actions, all with the same noise.
 
     Args:
-        config: an experiment whose model is steered by actions.
+        config: an experiment whose model is controlled by actions.
         params: its weights.
         episodes: held-out episodes with actions.
-        clips: the most clips to imagine (``choose_walks``).
-        seed: of the sampling noise.
+        clips: largest number of clips (``choose_walks``).
+        seed: seed of the sampling noise.
 
     Raises:
-        UserError: the episodes are too short, have no walks, or are all of one house.
+        UserError: the episodes are too short, have no walks, or are all from one house.
     """
     pieces = _Pieces(config, params, episodes, choose_walks(config, episodes, clips), seed)
     with Meter("steering", len(pieces.keys) * pieces.size, "clips") as meter:
@@ -299,20 +301,20 @@ def score(
     cache: ResultCache,
     log: Callable[[str], Any],
 ) -> tuple[Steered | None, str | None]:
-    """Measure it for a report, shared among processes and resumable.
+    """Measure steering for a report; resumable, and shared among processes.
 
     Args:
         config: the experiment.
         params: its weights.
         episodes: held-out episodes.
-        choices: the report's clips: as many walks are chosen, in the same episodes.
+        choices: the report's clips; equally many walks are chosen from the same episodes.
         cache: where results are stored.
-        log: shows a line.
+        log: prints a line.
 
     Returns:
-        What was measured, and a sentence on the clips. The first is None, and the sentence says
-        why, where the episodes have no walks in two houses; both are None where the model is not
-        steered by actions.
+        The results and a description of the clips. If the episodes have no walks in two houses, the
+        results are None and the description gives the reason; both are None if the model is not
+        controlled by actions.
     """
     if not config.model.capabilities.silent_actions:
         return None, None
@@ -320,7 +322,7 @@ def score(
     try:
         walks = choose_walks(config, episodes, len(choices), config.evaluate.chain, among)
     except UserError as error:
-        return None, f"Whether the actions steer is not measured: {error}"
+        return None, f"Steering is not measured: {error}"
     pieces = _Pieces(config, params, episodes, walks, config.evaluate.seeds[0])
 
     def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
@@ -340,7 +342,7 @@ def score(
 
 
 class _Pieces:
-    """The work in pieces: a kind of actions and a batch of clips, by its first one."""
+    """The units of work: a kind of actions and a batch of clips, identified by its first clip."""
 
     def __init__(
         self,
@@ -353,14 +355,14 @@ class _Pieces:
         self.config, self.params, self.seed = config, params, seed
         self.episodes, self.walks = episodes, walks
         self.size = min(config.evaluate.batch, len(walks.choices))
-        self._silent = _silenced(config, params)
+        self._silent = _with_zero_actions(config, params)
         self._imagine = jax.jit(_imagined, static_argnums=0)
         kinds = (TRUE, SHUFFLED, *([NONE] if self._silent is not None else []), COPY)
         starts = range(0, len(walks.choices), self.size)
         self.keys = [(kind, first) for kind in kinds for first in starts]
 
     def errors(self, kind: str, first: int) -> np.ndarray:
-        """Return (clips, N) squared errors of a batch."""
+        """Return (clips, N) mean squared errors of a batch."""
         batch = slice(first, first + self.size)
         parts = [self._load(choice) for choice in self.walks.choices[batch]]
         context = stack([part[0] for part in parts], self.size)
@@ -382,7 +384,7 @@ class _Pieces:
         return load_clip(self.config, self.episodes, choice)
 
     def joined(self, found: Mapping[tuple[str, int], np.ndarray]) -> Steered:
-        """Put the errors of all pieces together."""
+        """Combine the errors of all pieces."""
         kinds = dict.fromkeys(kind for kind, _ in self.keys)
         errors = {
             k: np.concatenate([found[key] for key in self.keys if key[0] == k]) for k in kinds
@@ -403,8 +405,8 @@ def _imagined(
     return jax.vmap(one)(context, actions, numbers_B)
 
 
-def _silenced(config: Config, params: Params) -> Params | None:
-    """Return weights whose control embeds every action as zero, or None if it does not modulate."""
+def _with_zero_actions(config: Config, params: Params) -> Params | None:
+    """Return weights whose control embeds every action as zero, or None without modulation."""
     if not config.model.capabilities.silent_actions or "control" not in params:
         return None
     return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

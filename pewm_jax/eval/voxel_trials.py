@@ -1,9 +1,10 @@
-"""Trials in a world of voxels: whether placed blocks persist, and what the 3D VAE reconstructs.
+"""Trials in a voxel world: whether placed blocks persist, and what the 3D VAE reconstructs.
 
-In each trial a world begins in a recorded grid. A block of one class is put on the floor in front
-of the agent, which then walks as recorded. Beside it the same walk without the block is imagined.
-Cells outside the window around the agent cannot change; inside, ``model.persistence_logit`` keeps
-them. The report also states how many frames had a part of the block in their window.
+In each trial a world starts from a recorded grid. A block of one class is placed on the floor in
+front of the agent, which then moves as recorded. The same walk without the block is imagined for
+comparison. Cells outside the window around the agent cannot change; inside,
+``model.persistence_logit`` preserves them. The report also states how many frames had a part of the
+block in their window.
 """
 
 from __future__ import annotations
@@ -30,26 +31,27 @@ from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist import world as persist
 
 AHEAD_M = (1.25, 1.75, 2.25, 0.75)
-"""Distances in front of the agent at which there may be room, metres, the best first."""
+"""Distances in front of the agent at which a block may be placed, metres, in order of
+preference."""
 BLOCK_M = (0.5, 0.5, 0.75)
 """Size of the block along x, y, z, metres."""
 STAYS = 0.5
 """Share of a block's cells that must still have its class."""
 SEEN = 4
-"""Rays of a frame that must meet the block first for it to count as in sight."""
+"""Number of rays of a frame that must hit the block first for it to count as visible."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Trials:
-    """What came of the trials.
+    """The results of the trials.
 
     Attributes:
-        kept_N: share of each block's cells that have its class in the end.
-        shown: in how many frames a block was in sight of its camera, and not all that was.
-        visible: in how many of these the picture is changed more there than elsewhere.
-        within: in how many frames a block was in the window that may change.
-        frames: how many frames there were, of all walks with a block.
-        asked: how many walks there were, with room for a block or without.
+        kept_N: share of each block's cells that have its class at the end.
+        shown: number of frames in which a block was visible, but did not fill the view.
+        visible: number of these in which the image changed more at the block than elsewhere.
+        within: number of frames in which a block was in the window that may change.
+        frames: number of frames of all walks with a block.
+        asked: number of walks, with or without room for a block.
         persistence_logit: ``model.persistence_logit``, nats.
     """
 
@@ -103,7 +105,7 @@ def block_class(config: Config, walks: Sequence[RecordedWalk], name: str = "") -
     Args:
         config: an experiment of a ``persist`` world.
         walks: one for each trial.
-        name: of the class; by default the first kind of furniture.
+        name: name of the class; by default the first kind of furniture.
 
     Raises:
         UserError: the walks have no voxels, or there is no such class.
@@ -124,16 +126,16 @@ def run(
     chunk: int = 16,
     count: int | None = None,
 ) -> Trials:
-    """Place, walk and look.
+    """Run the trials: place a block, imagine the walk, and measure persistence and visibility.
 
     Args:
         config: an experiment of a ``persist`` world.
         params: its weights.
-        walks: one for each trial, of one length, with voxels.
+        walks: one for each trial, of equal length, with voxels.
         name: class of the blocks; see ``block_class``.
-        batch: walks imagined at once.
-        chunk: frames imagined by one call.
-        count: trials that are enough: walks after these are not looked at; None for all.
+        batch: number of walks imagined at once.
+        chunk: number of frames imagined per call.
+        count: number of trials after which to stop; None for all walks.
 
     Raises:
         UserError: see ``block_class``.
@@ -189,11 +191,11 @@ def run(
 
 
 def block_visibility(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:
-    """Return whether a block is in sight, and whether the picture is changed more there.
+    """Return whether a block is visible, and whether the image changed more there.
 
     Args:
-        there_hw: bool, rays that meet the block first.
-        change_HW: by how much pixels differ from those of the same walk without it.
+        there_hw: bool, rays that hit the block first.
+        change_HW: difference of pixels from the same walk without the block.
     """
     rows, columns = (
         np.arange(size) * rays // size
@@ -206,7 +208,7 @@ def block_visibility(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool,
 
 
 class _Trial(NamedTuple):
-    """A walk with room for a block: its world without it and with it."""
+    """A walk with room for a block: its world without and with the block."""
 
     plain: WorldState
     edited: WorldState
@@ -216,7 +218,7 @@ class _Trial(NamedTuple):
 
 
 def _cells(model: PersistConfig, grid: ClassGrid, box_23: np.ndarray, number: int) -> int:
-    """Return how many cells of a box have a class."""
+    """Return the number of cells of a box that have a class."""
     held = class_grid.copy(model.memory, grid, jnp.asarray(box_23))
     return int((held.classes_XYZ == number).sum())
 
@@ -224,10 +226,11 @@ def _cells(model: PersistConfig, grid: ClassGrid, box_23: np.ndarray, number: in
 def _rays_on_block(
     model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any
 ) -> tuple[Array, Array]:
-    """Return which rays of a camera first meet a cell of a box, and whether its window has some.
+    """Return which rays first hit a cell of a box, and whether the window contains such a cell.
 
     Returns:
-        (rows, columns) bool, and () bool: a part of the box is in the window around the camera.
+        (rows, columns) bool, and () bool: whether a part of the box is in the window around the
+        camera.
     """
     place = camera.world_from_camera[0, :3, 3]
     first = windows.first_cell(model, grid.low_3, place)
@@ -257,27 +260,27 @@ def _stacked(trees: Sequence[Any]) -> Any:
 
 
 EVERY = 40
-"""Of a walk, frames from one grid that is looked at to the next."""
+"""Number of frames of a walk between the grids that are evaluated."""
 
 
 def reconstruction_shares(
     model: PersistConfig, params: Params, grids: Sequence[np.ndarray]
 ) -> dict[str, float]:
-    """Return shares of the cells whose class the autoencoder gives back.
+    """Return the shares of cells whose class the autoencoder reconstructs.
 
     Args:
         model: the world.
         params: its parameters.
-        grids: (T, X, Y, Z) class ids of each walk's frames, 0 where there is nothing; of larger
-            grids than the autoencoder's the middle is taken.
+        grids: (T, X, Y, Z) class ids of each walk's frames, 0 where there is nothing; grids larger
+            than the autoencoder's are cropped at the centre.
 
     Returns:
-        ``grids``: how many were looked at; ``occupied``: the share of occupied cells that come back
-        with their class; ``filled``: of these, those that come back as occupied at all; ``empty``:
-        the share of empty cells that come back empty.
+        ``grids``: number of grids evaluated; ``occupied``: share of occupied cells reconstructed
+        with their class; ``filled``: share of occupied cells reconstructed as occupied; ``empty``:
+        share of empty cells reconstructed as empty.
     """
     config = model.backbone.voxel_vae  # type: ignore[attr-defined]
-    again = jax.jit(functools.partial(_again, config))
+    again = jax.jit(functools.partial(_reconstruct, config))
     right = filled = occupied = clear = empty = count = 0
     for walk in grids:
         low = [(size - config.side) // 2 for size in walk.shape[1:]]
@@ -297,5 +300,5 @@ def reconstruction_shares(
     }
 
 
-def _again(config: VoxelVAEConfig, params: Params, grid_BXYZ: Array) -> Array:
+def _reconstruct(config: VoxelVAEConfig, params: Params, grid_BXYZ: Array) -> Array:
     return voxel_vae.decode(config, params, voxel_vae.encode(config, params, grid_BXYZ))

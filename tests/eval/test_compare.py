@@ -167,7 +167,7 @@ def test_what_is_no_pair_of_reports_is_refused(tmp_path, errors, capsys):
     with pytest.raises(UserError, match=r"has no report in .*pewm-jax evaluate"):
         compare.compare(a, tmp_path / "gone")
     other = report(tmp_path / "other", errors, seed=1, clip=configs.ClipConfig(frames=9))
-    with pytest.raises(UserError, match=r"no two seeds of one training: .*clip\.frames"):
+    with pytest.raises(UserError, match=r"not two seeds of one training: .*clip\.frames"):
         compare.compare(a, a, also_one=[other])
     with pytest.raises(UserError, match="trained with the same seed"):
         compare.compare(a, a, also_one=[report(tmp_path / "twin", errors)])

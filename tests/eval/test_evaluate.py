@@ -153,7 +153,9 @@ def test_metrics_hold_means_over_houses_with_intervals(run):
 @pytest.mark.slow
 def test_things_are_followed_where_the_episodes_have_instance_ids(run, copied, tmp_path, command):
     protocol = json.loads((run / "report" / "metrics.json").read_text())["protocol"]
-    assert protocol["scs"].startswith("SCS is left out, since the episodes have no instance ids")
+    assert protocol["scs"].startswith(
+        "SCS is not measured, because the episodes have no instance ids"
+    )
     assert protocol["scs_segmenter"] is None
     with pytest.raises(UserError, match=r"evaluate\.scs is flow, and .* collect them with --ids"):
         report.evaluate(copied, log=lambda _: None, scs="flow")
@@ -175,7 +177,7 @@ def test_things_are_followed_where_the_episodes_have_instance_ids(run, copied, t
     page = report.evaluate(copied, log=said.append, data=tmp_path / "data", lpips="off", scs="off")
     metrics = json.loads((page.parent / "metrics.json").read_text())
     assert metrics["scs"] is None
-    assert metrics["protocol"]["scs"] == "SCS is left out, as evaluate.scs says."
+    assert metrics["protocol"]["scs"] == "SCS is not measured (evaluate.scs)."
     assert metrics["protocol"]["fingerprint"] == fingerprint  # other scores are kept
     assert command([str(copied), "--data", str(tmp_path / "data"), "--scs", "nowhere"]) == 2
 
@@ -237,7 +239,7 @@ def test_a_protocol_is_written_before_training_and_followed(run, copied, tmp_pat
     report.evaluate(copied, log=lambda _: None)
     followed = json.loads((copied / "report" / "metrics.json").read_text())["protocol"]
     assert (followed["clips"], followed["seeds"]) == (3, [5])
-    with pytest.raises(UserError, match="--clips cannot be chosen beside"):
+    with pytest.raises(UserError, match="--clips cannot be combined with"):
         report.evaluate(copied, log=lambda _: None, clips=2)
     report.evaluate(copied, log=lambda _: None, protocol="off")
     own = json.loads((copied / "report" / "metrics.json").read_text())["protocol"]
@@ -336,10 +338,10 @@ def test_a_report_with_another_validation_split_is_not_complete(run, tmp_path):
 def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(copied, tmp_path):
     metrics = json.loads((copied / "report" / "metrics.json").read_text())
     assert "lpips" not in metrics["results"]["memory"]["all"]
-    assert metrics["protocol"]["lpips"].startswith("LPIPS is left out")
+    assert metrics["protocol"]["lpips"].startswith("LPIPS is not measured")
     assert metrics["protocol"]["lpips_weights_sha256"] is None
     page = (copied / "report" / "index.html").read_text()
-    assert "LPIPS is left out" in page
+    assert "LPIPS is not measured" in page
     assert "LPIPS[" not in page
 
     path = tmp_path / "vgg.safetensors"  # AlexNet takes no pictures this small

@@ -80,7 +80,7 @@ def test_rollouts_shorter_than_asked_are_said(episodes, tmp_path):
     more = dataclasses.replace(config.evaluate, video_clips=1000)
     asked = dataclasses.replace(config, evaluate=more)
     again = protocol(asked, episodes)
-    assert f"have {again.long_horizon} frames, and not the " in protocols.describe_shortened(
+    assert f"have {again.long_horizon} frames instead of the " in protocols.describe_shortened(
         asked, again
     )
 
@@ -103,7 +103,7 @@ def test_the_content_of_an_episode_is_part_of_it(episodes, tmp_path):
     last = read_episode(record(2, nod=0.2))
     changed[2] = last
     assert protocol(config, changed).sha256 != made.sha256
-    with pytest.raises(UserError, match="holds another one of that name"):
+    with pytest.raises(UserError, match="has another one of that name"):
         protocols.find_clips(made, changed, "data/mine")
     with pytest.raises(UserError, match=r"room-0/revisit .*does not hold it; name the folder"):
         protocols.find_clips(made, changed[1:], "data/mine")
@@ -144,9 +144,9 @@ def test_a_file_gives_back_what_was_written(episodes, tmp_path):
         (lambda value: value["protocol"].update(seeds=[9]), "was changed after it was written"),
         (lambda value: value.update(version=9), "versions 9 .file."),
         (lambda value: value["protocol"].update(scoring=1), "and 1 .scoring."),
-        (lambda value: value.update(format="other"), "is no protocol"),
-        (lambda value: value.pop("protocol"), "is no protocol"),
-        (lambda value: value.update(protocol=[]), "is no protocol"),
+        (lambda value: value.update(format="other"), "is not a protocol"),
+        (lambda value: value.pop("protocol"), "is not a protocol"),
+        (lambda value: value.update(protocol=[]), "is not a protocol"),
     ],
 )
 def test_a_file_that_cannot_be_trusted_is_refused(episodes, tmp_path, change, said):
@@ -169,7 +169,7 @@ def test_a_file_that_is_absent_or_no_json_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("path", "said"),
-    [("/dev/zero", "is no regular file"), ("/dev/full", "is no regular"), (".", "a folder")],
+    [("/dev/zero", "is not a regular file"), ("/dev/full", "is not a regular"), (".", "a folder")],
 )
 def test_what_is_no_file_is_refused_unread(path, said):
     """A device may have no end."""
@@ -194,10 +194,10 @@ def test_it_stands_above_the_settings(episodes, tmp_path):
     assert protocols.apply_protocol_file(plain, {}) == (plain, None)
     off = dataclasses.replace(plain, evaluate=dataclasses.replace(plain.evaluate, protocol="off"))
     assert protocols.apply_protocol_file(off, {"clips": 2})[1] is None
-    with pytest.raises(ConfigError, match="--clips and --seeds cannot be chosen beside"):
+    with pytest.raises(ConfigError, match="--clips and --seeds cannot be combined with"):
         protocols.apply_protocol_file(named, {"clips": 2, "seeds": (1,)})
     longer = named.with_model(clip=dataclasses.replace(plain.model.clip, frames=13))
-    with pytest.raises(UserError, match="8 imagined frames and this model imagines 12 at once"):
+    with pytest.raises(UserError, match="8 imagined frames but this model imagines 12 at once"):
         protocols.apply_protocol_file(longer, {})
     taller = named.with_model(clip=dataclasses.replace(plain.model.clip, height=32))
     with pytest.raises(UserError, match="16×16 and this model makes 32×16"):
@@ -215,7 +215,7 @@ def test_another_protocol_is_not_written_over(episodes, tmp_path):
     before = path.stat().st_mtime_ns
     protocols.write_protocol(config, path, said.append)
     assert path.stat().st_mtime_ns == before
-    assert "holds this protocol already" in said[-2]
+    assert "already contains this protocol" in said[-2]
     fewer = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, clips=2))
     with pytest.raises(UserError, match=r"another protocol \(4 and 2 clips\)"):
         protocols.write_protocol(fewer, path, said.append)

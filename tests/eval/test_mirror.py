@@ -98,9 +98,9 @@ def test_the_mirror_test_is_there_where_rollouts_are_long_or_it_is_asked_for(sce
         return mirror.way_out(dataclasses.replace(config, evaluate=evaluate), rollouts)
 
     assert way(-1)[0] == 0
-    assert "8 frames and not 64" in way(-1)[1]
+    assert "8 frames, fewer than 64" in way(-1)[1]
     assert way(-1, 64)[0] == way(-1, 112)[0] == 32
-    assert way(0, 64) == (0, "The mirror test is left out, as evaluate.mirror says.")
+    assert way(0, 64) == (0, "The mirror test is disabled (evaluate.mirror).")
     assert [way(asked)[0] for asked in (8, 7, 99)] == [8, 6, 8]  # whole clips of 4
     assert "do not fill a clip" in way(1)[1]
     with pytest.raises(ConfigError, match=r"evaluate\.mirror is -2"):
@@ -168,7 +168,7 @@ def test_measures_that_cost_are_left_out_in_a_sentence(monkeypatch):
     assert "no weights of I3D are installed" in selection.select_fvd("", 9, accelerator=True)[1]
     monkeypatch.setattr(i3d_weights, "installed", lambda: "there")
     assert "I3D needs 9 frames and a clip has 5" in selection.select_fvd("", 5, accelerator=True)[1]
-    assert "--fvd on asks for them" in selection.select_fvd("", 9, accelerator=False)[1]
+    assert "--fvd on enables them" in selection.select_fvd("", 9, accelerator=False)[1]
     assert selection.select_fvd("off", 9, accelerator=True)[0] is None
     with pytest.raises(UserError, match="too short for I3D"):
         selection.select_fvd("on", 5, accelerator=True)

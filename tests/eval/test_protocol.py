@@ -20,8 +20,8 @@ from pewm_jax.eval.clips import (
     context_frames,
     fingerprint,
     load_clip,
+    return_start,
     stack,
-    way_back,
 )
 from pewm_jax.eval.reproject import CANDIDATES, reproject
 from pewm_jax.geometry.actions import integrate
@@ -72,9 +72,9 @@ def test_choices_are_distinct_and_on_the_way_back(episodes, tmp_path_factory, cl
 
 
 def test_the_middle_is_the_way_back_where_none_is_recorded(episodes):
-    assert way_back(episodes[0]) == 12
-    assert way_back(dataclasses.replace(episodes[0], info={})) == episodes[0].length // 2
-    assert way_back(dataclasses.replace(episodes[0], info={"return_frame": 0})) == 0
+    assert return_start(episodes[0]) == 12
+    assert return_start(dataclasses.replace(episodes[0], info={})) == episodes[0].length // 2
+    assert return_start(dataclasses.replace(episodes[0], info={"return_frame": 0})) == 0
 
 
 def test_actions_lead_through_the_targets(episodes, tmp_path):
@@ -100,7 +100,7 @@ def test_actions_that_disagree_with_poses_are_refused(tmp_path):
     poses = good.world_from_camera.copy()
     poses[14:] = poses[14:] @ tilt
     nodding = dataclasses.replace(good, world_from_camera=poses, actions=None)
-    with pytest.raises(UserError, match="upright motion"):
+    with pytest.raises(UserError, match="planar motion"):
         load_clip(config, [nodding], choose(config, [nodding], 1, 1)[0])
 
 

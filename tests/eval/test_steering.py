@@ -105,7 +105,7 @@ def test_what_was_not_measured_is_said(obeying, monkeypatch, tmp_path):
     metrics = {"steering": None, "protocol": {"steering": about}}
     assert evaluation_page.steering(metrics) is None
     assert format_steering(metrics) == [about]
-    assert about.startswith("Whether the actions steer is not measured: no episode of")
+    assert about.startswith("Steering is not measured: no episode of")
     assert format_steering({"steering": None, "protocol": {"steering": None}}) == []
 
 
@@ -174,10 +174,10 @@ def test_spins_are_skipped_and_refused_where_there_is_nothing_else():
     walks = choose_walks(CONFIG, mixed, 6)
     assert {choice.scene for choice in walks.choices} == {"b"}
     assert {other.scene for other in walks.others} <= {"a", "c"}
-    with pytest.raises(UserError, match="can be given other actions"):
+    with pytest.raises(UserError, match="has a partner with different actions"):
         choose_walks(CONFIG, [episode(walk, "b")] * 2, 4)  # of one house
     straight = [episode([FORWARD] * 63, scene) for scene in "ab"]
-    with pytest.raises(UserError, match="can be given other actions"):
+    with pytest.raises(UserError, match="has a partner with different actions"):
         choose_walks(CONFIG, straight, 4)  # all go the same way
     with pytest.raises(UserError, match="long enough for 9 frames"):
         choose_walks(CONFIG, [episode(walk[:5], "a")], 4)

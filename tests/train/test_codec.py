@@ -349,7 +349,7 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     result = json.loads((run / "report" / "codec-validation.json").read_text())
     assert result["episodes"] == 6
     numbers = result["numbers"]
-    assert f"depth off by, cm               {numbers['depth_cm']['mean']:.3f} ± " in out
+    assert f"depth error, cm                {numbers['depth_cm']['mean']:.3f} ± " in out
 
     config, params = pewm_jax.load(run)
     one = codec_score.EpisodeSource(data / "validation")[0].frames()
@@ -364,7 +364,7 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     longer = dataclasses.replace(config.train.statistics, steps=3)
     half = dataclasses.replace(config.train, statistics=longer)
     configuration.save(dataclasses.replace(config, train=half), run / "config.json")
-    with pytest.raises(UserError, match="is not trained to its end"):
+    with pytest.raises(UserError, match="is not fully trained"):
         codec_score.score(run, data=data, split="validation")
     with pytest.raises(ConfigError, match="leave out --seeds, --steps"):
         program.execute(["evaluate", str(run), "--steps", "2", "--seeds", "0"])

@@ -1,33 +1,35 @@
-"""Metrics of imagined frames against true ones, and the registry of their names.
+"""Metrics of imagined frames against ground truth, and the registry of their names.
 
     metric = metrics.load("lpips_alex")
     each_B = metric(imagined_BTHWC, truth_BTHWC)
 
 Every metric takes clips of one shape, colours as uint8 or as floats in [−1, 1] (values outside are
-clipped), and returns one number per clip, whatever else is in the batch; ``fvd`` and ``kvd`` return
-one per set.
+clipped), and returns one number per clip, independent of the rest of the batch; ``fvd`` and ``kvd``
+return one per set.
 
 ================ ====== ===========================================================================
-psnr             higher decibels, of the mean squared error of all pixels of a clip; at most 100
+psnr             higher dB, of the mean squared error of all pixels of a clip; at most 100
 ssim             higher structural similarity, 11 × 11 Gaussian windows, averaged over a clip
-lpips_alex       lower  LPIPS with AlexNet, averaged over a clip's frames; pictures are not resized
-lpips_vgg        lower  LPIPS with VGG16, the same
+lpips_alex       lower  LPIPS with AlexNet, averaged over a clip's frames; images are not resized
+lpips_vgg        lower  LPIPS with VGG16, likewise
 depth_mae        lower  mean error of depth, m; it takes depths (B, T, H, W) instead of colours
-depth_rel        lower  the same, divided by the true depth
+depth_rel        lower  likewise, divided by the true depth
 dreamsim         lower  DreamSim (0.2, ensemble), averaged over a clip's frames
 fvd              lower  Fréchet distance of the 400 logits of I3D; 9 frames or more; with its floor
-kvd              lower  kernel distance of the same: no bias by the number of clips; may be negative
-src              higher clips that go and come back: cosine × 100 of DINOv2's features of both
-                        visits of a place, of the imagined clip alone (of the truth only the shape
-                        counts); with its floor and ceiling
+kvd              lower  kernel distance of the same; unbiased in the number of clips; may be
+negative src              higher clips that go out and return: cosine × 100 of DINOv2 features of
+both visits
+                        of a place, in the imagined clip only (of the ground truth only the shape is
+                        used); with its floor and ceiling
 src[alex]        higher the same with LPIPS's AlexNet as the encoder; and src[vgg]
-mirror[METRIC]   as     clips that go and come back: the way back against the way out by ``psnr``,
+mirror[METRIC]   as     clips that go out and return: the return path against the way out by
+                 METRIC ``psnr``, ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with floor and ceiling
                  METRIC ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with its floor and ceiling
 ================ ====== ===========================================================================
 
-Where each is defined: ``images`` (PSNR, SSIM, depth, and errors over seen and unseen pixels,
+Modules: ``images`` (PSNR, SSIM, depth, and errors over seen and unseen pixels,
 ``error_sums``), ``perceptual`` (LPIPS, DreamSim), ``videos`` (FVD, KVD), ``revisits`` (SRC, the
-mirror test), ``structure`` (SCS). ``selection`` chooses those of a report.
+mirror test), ``structure`` (SCS). ``selection`` selects those of a report.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ __all__ = [
 ]
 
 Weights: TypeAlias = str | Path | None
-"""A file or folder of weights, or None for those of the installed package."""
+"""A file or folder of weights, or None for the weights in the installed package."""
 
 
 def _lpips(net: Net) -> Callable[[Weights], Metric]:
@@ -108,44 +110,44 @@ def load(name: str, weights: Weights = None) -> Metric:
     Args:
         name: one of ``NAMES``.
         weights: a file of weights for a metric that is a network (``models.lpips.convert`` and
-            ``models.i3d.convert`` list the formats; for ``src`` a folder of DINOv2); by default
-            those of the installed package.
+            ``models.i3d.convert`` list the formats; for ``src`` a folder of DINOv2); by default the
+            weights in the installed package.
 
     Raises:
-        UserError: there is no such metric, it takes no weights, or it needs some and has none.
+        UserError: there is no such metric, it takes no weights, or it needs weights and has none.
     """
     if weights is not None and not str(weights):
-        raise UserError(f"the name of the weights of {name} is empty: name a file, or leave it.")
+        raise UserError(f"the name of the weights of {name} is empty: give a file, or omit it.")
     if name not in NAMES:
         raise UserError(f"there is no metric {name!r}; choose one of {', '.join(NAMES)}.")
     reader = _NETWORKS.get(name) or _MIRRORS.get(name)
     if reader is not None:
         return reader(weights)
     if weights is not None:
-        raise UserError(f"the metric {name} is no network and takes no weights, got {weights}.")
+        raise UserError(f"the metric {name} is not a network and takes no weights, got {weights}.")
     return (PLAIN | DEPTHS)[name]
 
 
 def load_all(
     names: Iterable[str] = _COLOURS, weights: Mapping[str, str | Path] | None = None
 ) -> tuple[dict[str, Metric], dict[str, str]]:
-    """Return the metrics whose weights are available, and why the others are left out.
+    """Return the metrics whose weights are available, and the reasons why the others are skipped.
 
     Args:
         names: some of ``NAMES``; by default all that take colours.
         weights: metric → file or folder of weights.
 
     Returns:
-        ``(found, left_out)``: name → metric, and name → the reason, a sentence.
+        ``(metrics, skipped)``: name → metric, and name → reason as a sentence.
 
     Raises:
-        UserError: there is no such metric, or weights that are named are absent or damaged, or of
-            no metric that is asked for.
+        UserError: there is no such metric, or weights are missing, damaged, or given for a metric
+            that is not requested.
     """
     names = tuple(names)
-    strange = sorted(set(weights or {}) - set(names))
-    if strange:
-        raise UserError(f"weights are given for {', '.join(strange)}, which are not asked for.")
+    unused = sorted(set(weights or {}) - set(names))
+    if unused:
+        raise UserError(f"weights are given for {', '.join(unused)}, which are not requested.")
     found: dict[str, Metric] = {}
     left_out: dict[str, str] = {}
     for name in names:

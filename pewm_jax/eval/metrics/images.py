@@ -1,8 +1,8 @@
 """Image errors under masks: PSNR, SSIM, depth error.
 
-Errors are stored as *sums under masks* (``error_sums``) until the end, so one pass over the samples
-yields every table: per clip, per frame index, per mask, in any grouping. Colours are compared in
-[0, 1], after the networks' [−1, 1] is shifted and clipped.
+Errors are stored as *sums under masks* (``error_sums``), so one pass over the samples yields every
+table: per clip, per frame index, per mask, in any grouping. Colours are compared in [0, 1], after
+the networks' [−1, 1] is shifted and clipped.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from pewm_jax.io import tree
 from pewm_jax.types import Array, Frames, Params
 
 WINDOW, SIGMA = 11, 1.5
-"""SSIM's Gaussian window and its standard deviation, pixels (Wang et al. 2004)."""
+"""Size and standard deviation of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
 PSNR_CEILING = 100.0
-"""PSNR of equal images, in decibels, which keeps averages finite."""
+"""PSNR of equal images, in dB; it keeps averages finite."""
 MASKS = ("seen", "unseen", "all")
-"""Which pixels: seen before, never seen, all of them."""
+"""The masks: pixels seen before, pixels never seen, all pixels."""
 MEASURED = ("squared", "colours", "ssim", "windows", "depth_abs", "depth_rel", "depths")
 SUMS = (*MEASURED, "lpips", "pictures")
-"""The sums that ``error_sums`` returns, in order; the last two are 0 until ``with_lpips``."""
+"""The sums returned by ``error_sums``, in order; the last two are 0 until ``with_lpips``."""
 
 
 def unit_colours(rgb: Array) -> Array:
@@ -37,7 +37,7 @@ def unit_colours(rgb: Array) -> Array:
 
 
 def psnr(mean_squared_error: Array) -> Array:
-    """Return decibels for errors of colours in [0, 1]; at most ``PSNR_CEILING``."""
+    """Return the PSNR in dB for errors of colours in [0, 1]; at most ``PSNR_CEILING``."""
     floor = 10 ** (-PSNR_CEILING / 10)
     return -10 * jnp.log10(jnp.maximum(mean_squared_error, floor))
 
@@ -50,7 +50,7 @@ def gaussian_window() -> np.ndarray:
 
 
 def _band(length: int) -> np.ndarray:
-    """Return the (length − 10, length) matrix that slides the window along one axis."""
+    """Return the (length − 10, length) matrix that applies the window along one axis."""
     rows = length - WINDOW + 1
     band = np.zeros((rows, length), np.float32)
     for row in range(rows):
@@ -59,7 +59,7 @@ def _band(length: int) -> np.ndarray:
 
 
 def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
-    """Structural similarity around each pixel (Wang et al. 2004, Eq. 13; K1 = .01, K2 = .03).
+    """Return structural similarity per pixel (Wang et al. 2004, Eq. 13; K1 = .01, K2 = .03).
 
     Args:
         a_HWC: (..., H, W, 3) colours in [0, 1], H and W at least 11.
@@ -73,7 +73,7 @@ def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
     rows, columns = jnp.asarray(_band(height)), jnp.asarray(_band(width))
 
     def blur(x):
-        """Slide the window, as two products of large matrices: (..., 3, H, W) to (..., 3, v, u)."""
+        """Apply the window by two matrix products: (..., 3, H, W) to (..., 3, v, u)."""
         along_width = jnp.matmul(x, columns.T, precision="highest")
         return jnp.matmul(jnp.swapaxes(along_width, -1, -2), rows.T, precision="highest")
 
@@ -131,7 +131,7 @@ error_sums_batch = jax.jit(jax.vmap(error_sums))
 
 
 def with_lpips(sums: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Return sums with LPIPS, which is of whole pictures: under the mask ``all`` alone.
+    """Return sums with LPIPS, which is defined for whole images: only under the mask ``all``.
 
     Args:
         sums: (..., T, 3, 9) from ``error_sums``.
@@ -154,18 +154,19 @@ class Metric(Protocol):
             truth_BTHWC: the same shape.
 
         Raises:
-            UserError: the clips are not alike, or not such colours.
+            UserError: the clips differ in shape, or are not such colours.
         """
         ...
 
 
-def marked(network: str, params: Params, published: str) -> str:
-    """Return a network's name, with the first 8 digits of a hash of weights of one's own.
+def name_with_hash(network: str, params: Params, published: str) -> str:
+    """Return a network's name, with 8 digits of the hash of weights that are not published.
 
     Args:
         network: its name.
         params: its weights.
-        published: ``tree.digest`` of those that need no mark, whatever file they come from.
+        published: ``tree.digest`` of the published weights, which is independent of the file
+            format.
     """
     digest = tree.digest(params)
     return network if digest == published else f"{network}-{digest[:8]}"
@@ -175,10 +176,10 @@ def colours(imagined_BTHWC: Array, truth_BTHWC: Array) -> tuple[Array, Array]:
     """Return both clips in [0, 1], clipped.
 
     Raises:
-        UserError: they are not alike, or not colours.
+        UserError: they differ in shape, or are not colours.
     """
     if imagined_BTHWC is None or truth_BTHWC is None:
-        raise UserError("there is no clip to compare: give both as (B, T, H, W, 3).")
+        raise UserError("no clips to compare: give both as (B, T, H, W, 3).")
     pair = jnp.asarray(imagined_BTHWC), jnp.asarray(truth_BTHWC)
     shapes = [clip.shape for clip in pair]
     if shapes[0] != shapes[1] or len(shapes[0]) != 5 or shapes[0][-1] != 3:
@@ -187,18 +188,18 @@ def colours(imagined_BTHWC: Array, truth_BTHWC: Array) -> tuple[Array, Array]:
             "(B, T, H, W, 3)."
         )
     if 0 in shapes[0]:
-        raise UserError(f"clips of shape {shapes[0]} are empty: give one picture at least.")
+        raise UserError(f"clips of shape {shapes[0]} are empty: give at least one image.")
     for clip in pair:
         if clip.dtype != jnp.uint8 and not jnp.issubdtype(clip.dtype, jnp.floating):
             raise UserError(
-                f"colours of type {clip.dtype} are not known: give floats in [−1, 1], or uint8."
+                f"colours of type {clip.dtype} are not supported: give floats in [−1, 1], or uint8."
             )
     return unit_colours(pair[0]), unit_colours(pair[1])
 
 
 @jax.jit
 def clip_psnr(imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
-    """Return decibels, of the mean squared error of all pixels of a clip; see ``Metric``."""
+    """Return PSNR in dB, of the mean squared error of all pixels of a clip; see ``Metric``."""
     imagined, truth = colours(imagined_BTHWC, truth_BTHWC)
     return psnr(jnp.square(imagined - truth).mean((1, 2, 3, 4)))
 
@@ -208,13 +209,13 @@ def clip_ssim(imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
     """Return structural similarity, averaged over a clip's windows; see ``Metric``.
 
     Raises:
-        UserError: also where pictures are smaller than a window.
+        UserError: also if images are smaller than a window.
     """
     imagined, truth = colours(imagined_BTHWC, truth_BTHWC)
     height, width = imagined.shape[2:4]
     if min(height, width) < WINDOW:
         raise UserError(
-            f"pictures of {height}×{width} pixels are too small for SSIM, whose window is "
+            f"images of {height}×{width} pixels are too small for SSIM, whose window is "
             f"{WINDOW}×{WINDOW}."
         )
     return ssim_map(imagined, truth).mean((1, 2, 3))
@@ -226,16 +227,16 @@ PLAIN: dict[str, Metric] = {"psnr": clip_psnr, "ssim": clip_ssim}
 
 @jax.jit
 def clip_depth_mae(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
-    """Return the mean absolute error, m, (B,), where both have a depth; NaN where none has.
+    """Return the mean absolute error, m, (B,), where both have a depth; NaN if none has.
 
-    A clip with an imagined depth that is no number has no score: NaN.
+    A clip with an imagined depth that is not finite has no score: NaN.
 
     Args:
         imagined_BTHW: (B, T, H, W) or (B, T, H, W, 1) depths along the optical axis, m; 0 for none.
         truth_BTHW: the same shape.
 
     Raises:
-        UserError: the clips are not alike, or no floats.
+        UserError: the clips differ in shape, or are not floats.
     """
     imagined, truth, both = _depths(imagined_BTHW, truth_BTHW)
     return _mean_where(both, jnp.abs(imagined - truth), imagined)
@@ -249,9 +250,9 @@ def clip_depth_rel(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
 
 
 def _depths(imagined_BTHW: Array, truth_BTHW: Array) -> tuple[Array, Array, Array]:
-    """Return both, and where both have a depth."""
+    """Return both, and the mask where both have a depth."""
     if imagined_BTHW is None or truth_BTHW is None:
-        raise UserError("there is no depth to compare: give both as (B, T, H, W), metres.")
+        raise UserError("no depth to compare: give both as (B, T, H, W), metres.")
     imagined, truth = jnp.asarray(imagined_BTHW), jnp.asarray(truth_BTHW)
     shaped = imagined.ndim == 4 or (imagined.ndim == 5 and imagined.shape[-1] == 1)
     if imagined.shape != truth.shape or not shaped:
@@ -260,19 +261,19 @@ def _depths(imagined_BTHW: Array, truth_BTHW: Array) -> tuple[Array, Array, Arra
             "(B, T, H, W), metres."
         )
     if 0 in imagined.shape:
-        raise UserError(f"depths of shape {imagined.shape} are empty: give one picture at least.")
+        raise UserError(f"depths of shape {imagined.shape} are empty: give at least one image.")
     for clip in (imagined, truth):
         if not jnp.issubdtype(clip.dtype, jnp.floating):
-            raise UserError(f"depths of type {clip.dtype} are not known: give floats, metres.")
+            raise UserError(f"depths of type {clip.dtype} are not supported: give floats, metres.")
     return imagined, truth, (imagined > 0) & (truth > 0)
 
 
 def _mean_where(mask_B: Array, values_B: Array, imagined_B: Array) -> Array:
-    """Return means under a mask; NaN where that is empty, or what was imagined is not finite."""
+    """Return means under a mask; NaN if the mask is empty or an imagined value is not finite."""
     axes = tuple(range(1, mask_B.ndim))
     mean_B = jnp.where(mask_B, values_B, 0).sum(axes) / mask_B.sum(axes)
     return jnp.where(jnp.isfinite(imagined_B).all(axes), mean_B, jnp.nan)
 
 
 DEPTHS: dict[str, Metric] = {"depth_mae": clip_depth_mae, "depth_rel": clip_depth_rel}
-"""The metrics of depth, which take it in the place of colours."""
+"""The metrics of depth, which take depths instead of colours."""

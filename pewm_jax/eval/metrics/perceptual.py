@@ -1,4 +1,4 @@
-"""LPIPS and DreamSim of clips: frame by frame, a bounded number of pictures at once."""
+"""LPIPS and DreamSim of clips: per frame, with a bounded number of images at once."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import jax
 
 from pewm_jax.config import UserError
-from pewm_jax.eval.metrics.images import colours, marked
+from pewm_jax.eval.metrics.images import colours, name_with_hash
 from pewm_jax.models.dreamsim import convert as dreamsim_weights
 from pewm_jax.models.dreamsim import model as dreamsim
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -20,13 +20,14 @@ from pewm_jax.models.lpips.model import LEAST, NAMES, Net
 from pewm_jax.types import Array, Params
 
 PIXELS = 2**17
-"""Pixels of imagined pictures that are in the network at once, or one picture if it has more."""
+"""Pixels of imagined images in the network at once, or one image if it has more."""
 KEPT = 2**28
-"""Bytes of the truth's features that are cached; if there are more, they are computed each time."""
+"""Bytes of ground-truth features that are cached; if there are more, they are recomputed each
+time."""
 OFF = "off"
-"""The setting that leaves LPIPS out."""
+"""The setting that disables LPIPS."""
 PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
-"""The settings that stand for a network of the installed package."""
+"""The settings that select a network in the installed package."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,8 +37,9 @@ class LPIPS:
     Attributes:
         net: the network.
         params: its parameters.
-        sha256: hash of the file that they were read from.
-        encoder: the network's name; weights other than the package's mark it (``alex-1a2b3c4d``).
+        sha256: hash of the weights file.
+        encoder: the network's name, with a hash for weights other than the package's
+            (``alex-1a2b3c4d``).
     """
 
     net: Net
@@ -53,20 +55,20 @@ class LPIPS:
         """Return the distance of every frame, (B, T); arguments as of ``Metric``.
 
         Raises:
-            UserError: the clips are not alike, or too small for the network.
+            UserError: the clips differ in shape, or are too small for the network.
         """
         imagined, truth = colours(imagined_BTHWC, truth_BTHWC)
         lpips.require_size(self.net, *imagined.shape[2:4])
         return _distances(self.net, self.params, imagined, truth)
 
     def towards(self, truth_BTHWC: Array) -> Callable[[Array], Array]:
-        """Return ``frames`` from any clips to these, which pass through the network once.
+        """Return ``frames`` with a fixed ground truth, which passes through the network only once.
 
         Args:
-            truth_BTHWC: as of ``Metric``.
+            truth_BTHWC: as for ``Metric``.
 
         Returns:
-            ``imagined_BTHWC -> distances (B, T)``, which raises what ``frames`` raises.
+            ``imagined_BTHWC -> distances (B, T)``, which raises the same errors as ``frames``.
         """
         made = jax.eval_shape(self.described, truth_BTHWC)
         if sum(x.size * x.dtype.itemsize for x in made) > KEPT:
@@ -80,16 +82,16 @@ class LPIPS:
         return to
 
     def described(self, truth_BTHWC: Array) -> tuple[Array, ...]:
-        """Return ``lpips.describe`` of all pictures of some clips."""
+        """Return ``lpips.describe`` of all images of clips."""
         truth, _ = colours(truth_BTHWC, truth_BTHWC)
         lpips.require_size(self.net, *truth.shape[2:4])
         return _described(self.net, self.params, truth)
 
     @property
     def about(self) -> str:
-        """What is measured, for the protocol."""
+        """Return a description for the protocol."""
         return (
-            f"version 0.1 with {NAMES[self.net]}, of colours in [−1, 1], whole pictures, not "
+            f"version 0.1 with {NAMES[self.net]}, of colours in [−1, 1], whole images, not "
             "resized, averaged over a clip's frames; lower is better"
         )
 
@@ -110,7 +112,7 @@ def _distances(net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Arr
 
 @functools.partial(jax.jit, static_argnums=0)
 def _described(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...]:
-    """Describe colours in [0, 1]; pictures first."""
+    """Return the features of colours in [0, 1]; the image axis comes first."""
     pictures = 2 * truth_BTHWC.reshape(-1, *truth_BTHWC.shape[2:]) - 1
 
     def one(picture: Array) -> tuple[Array, ...]:
@@ -123,7 +125,7 @@ def _described(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...
 def _to_described(
     net: Net, params: Params, imagined_BTHWC: Array, truth: tuple[Array, ...]
 ) -> Array:
-    """Compare colours in [0, 1] with what was described."""
+    """Compare colours in [0, 1] with precomputed features."""
     clips, frames = imagined_BTHWC.shape[:2]
     pictures = 2 * imagined_BTHWC.reshape(-1, *imagined_BTHWC.shape[2:]) - 1
 
@@ -144,7 +146,7 @@ def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
 
     Args:
         path: the file.
-        net: the network that it must be of; by default whichever it is.
+        net: the required network; by default the file's.
 
     Raises:
         UserError: see ``models.lpips.convert.read``.
@@ -152,23 +154,23 @@ def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
     found, params = lpips_weights.read(path, net)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    name = marked(found, params, lpips_weights.PUBLISHED[found])
+    name = name_with_hash(found, params, lpips_weights.PUBLISHED[found])
     return LPIPS(found, jax.device_put(params), digest, name)
 
 
 def select_lpips(setting: str, height: int, width: int) -> tuple[LPIPS | None, str]:
-    """Return the LPIPS that a setting asks for, and a sentence on it or on why there is none.
+    """Return the LPIPS that a setting selects, and a description or the reason for None.
 
     Args:
         setting: ``evaluate.lpips``.
-        height: of the pictures that are scored, pixels.
-        width: the same.
+        height: height of the scored images, pixels.
+        width: width of the scored images, pixels.
 
     Raises:
-        UserError: what is asked for by name is not there, is damaged, or cannot take such pictures.
+        UserError: explicitly requested weights are missing, damaged, or unsuitable for such images.
     """
     if setting == OFF:
-        return None, "LPIPS is left out, as evaluate.lpips says."
+        return None, "LPIPS is not measured (evaluate.lpips)."
     if setting:
         net = PACKAGED.get(setting)
         metric = read_lpips(lpips_weights.find(net) if net else Path(setting), net)
@@ -177,20 +179,20 @@ def select_lpips(setting: str, height: int, width: int) -> tuple[LPIPS | None, s
     path = lpips_weights.installed("alex")
     if path is None:
         return None, (
-            f"LPIPS is left out, since no weights of it are installed: {lpips_weights.INSTALL}, or "
-            "name a file of them by --lpips."
+            f"LPIPS is not measured, because no weights are installed: {lpips_weights.INSTALL}, or "
+            "give a weights file by --lpips."
         )
     if min(height, width) < LEAST["alex"]:
         return None, (
-            f"LPIPS is left out: its {NAMES['alex']} needs pictures of {LEAST['alex']} pixels each "
-            f"way and these have {width} × {height}; --lpips vgg takes smaller ones."
+            f"LPIPS is not measured: {NAMES['alex']} needs images of at least {LEAST['alex']} "
+            f"pixels per side and these have {width} × {height}; --lpips vgg accepts smaller ones."
         )
     metric = read_lpips(path, "alex")
     return metric, metric.about
 
 
 PICTURES = 8
-"""Pairs of pictures in the networks of DreamSim at once."""
+"""Pairs of images in the networks of DreamSim at once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,9 +214,9 @@ class DreamSim:
 
     @property
     def about(self) -> str:
-        """What is measured, for the protocol."""
+        """Return a description for the protocol."""
         return (
-            "DreamSim 0.2, the ensemble of DINO, CLIP and OpenCLIP; pictures resized to 224 × 224 "
+            "DreamSim 0.2, the ensemble of DINO, CLIP and OpenCLIP; images resized to 224 × 224 "
             "(bicubic, antialiased); lower is better"
         )
 
@@ -235,12 +237,12 @@ def read_dreamsim(folder: str | Path | None) -> DreamSim:
     """Read DreamSim from a folder; see ``models.dreamsim.convert``.
 
     Raises:
-        UserError: none is named, or it is absent or damaged.
+        UserError: no folder is given, or it is missing or damaged.
     """
     if folder is None:
         raise UserError(
-            "DreamSim needs weights, which come with no package: name the folder that the package "
-            "dreamsim 0.2 keeps them in."
+            "DreamSim needs weights, which ship with no package: give the folder in which the "
+            "package dreamsim 0.2 stores them."
         )
     params = dreamsim_weights.read(Path(folder))
     digest = hashlib.sha256()

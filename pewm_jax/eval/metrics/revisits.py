@@ -1,16 +1,16 @@
-"""SRC and the mirror test: does a place look the same when the agent comes back?
+"""SRC and the mirror test: does a place look the same when the agent returns?
 
-The agent goes a path and comes back the same way (``actions.there_and_back``): frame k and frame
-T − 1 − k of a clip are taken from one camera. The way back, turned round, is compared with the way
-out.
+The agent follows a path and returns the same way (``actions.there_and_back``): frames k and T − 1 −
+k of a clip have the same camera. The reversed return path is compared with the way out.
 
-- **SRC**, scene revisit consistency (Hong et al. 2024, SlowFast-VGen; PEWM, Sec. 4): by the cosine
-  between features of an image encoder, times 100. PEWM's encoder is DINOv2; which features, and how
-  they are averaged, it does not say. Here it is the class token, and the mean over places.
-- **The mirror test** (MIND 2026): by any measure of pictures, ``mirror[psnr]``.
+- **SRC**, scene revisit consistency (Hong et al. 2024, SlowFast-VGen; PEWM, Sec. 4): the cosine
+  similarity of image-encoder features, times 100. PEWM uses DINOv2 but does not specify which
+  features and how they are averaged. Here it is the class token, averaged over places.
+- **The mirror test** (MIND 2026): any image metric, ``mirror[psnr]``.
 
-Consistency says nothing of truth: a model that always shows one picture is perfectly consistent.
-So the truth's own number, the ceiling, and what two different places get, the floor, stand beside.
+Consistency does not imply correctness: a model that always shows one image is perfectly consistent.
+So the score of the ground truth (the ceiling) and the score of two different places (the floor) are
+reported as well.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import UserError
-from pewm_jax.eval.metrics.images import Metric, colours, marked
+from pewm_jax.eval.metrics.images import Metric, colours, name_with_hash
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config, size_name
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -35,12 +35,13 @@ from pewm_jax.types import Array, Params
 
 @dataclasses.dataclass(frozen=True)
 class RevisitScore:
-    """How alike first and later visits are.
+    """Similarity of first and second visits.
 
     Attributes:
-        value_B: of every imagined clip.
-        ceiling_B: of its truth.
-        floor_B: of the truth's way out and the way back of another clip's truth, another place.
+        value_B: for every imagined clip.
+        ceiling_B: for its ground truth.
+        floor_B: the ground truth's way out against the return path of another clip's ground truth,
+            a different place.
     """
 
     value_B: Array
@@ -57,31 +58,31 @@ class RevisitScore:
 
 @dataclasses.dataclass(frozen=True)
 class Revisit:
-    """Compares the way back with the way out; a ``Metric``.
+    """Compares the return path with the way out; a ``Metric``.
 
     Attributes:
-        name: of the measure, with the encoder's or the measure's that pictures are compared by.
-        compare: the measure.
+        name: name of the metric, including the encoder or the image metric.
+        compare: the image metric.
     """
 
     name: str
     compare: Metric
 
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
-        """Return the number of every imagined clip, (B,).
+        """Return the score of every imagined clip, (B,).
 
-        The truth must be of its shape, and no more: what is compared are two visits of one clip.
-        A clip that does not come back is therefore not best even against itself.
+        The ground truth only needs the same shape: the two visits of one clip are compared. So a
+        clip that does not return does not get the best score even against itself.
 
         Raises:
-            UserError: the clips are not alike, or are no way out and back.
+            UserError: the clips differ in shape, or have no way out and back.
         """
         colours(imagined_BTHWC, truth_BTHWC)
         out, back = ways(imagined_BTHWC)
         return self.compare(back, out)
 
     def score(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> RevisitScore:
-        """Return the numbers of imagined clips between a floor and a ceiling.
+        """Return the scores of imagined clips with floor and ceiling.
 
         Args:
             imagined_BTHWC: (B, T, H, W, 3), B ≥ 2 clips of different places, frame k and T − 1 − k
@@ -89,11 +90,11 @@ class Revisit:
             truth_BTHWC: the same shape.
 
         Raises:
-            UserError: the clips are not alike, are no way out and back, or there is only one.
+            UserError: the clips differ in shape, have no way out and back, or there is only one.
         """
         if len(truth_BTHWC) < 2:
             raise UserError(
-                "a floor needs another place: give at least 2 clips, of different ones."
+                "a floor needs a second place: give at least 2 clips of different places."
             )
         value_B = self(imagined_BTHWC, truth_BTHWC)
         out, back = ways(truth_BTHWC)
@@ -102,12 +103,12 @@ class Revisit:
 
 
 def ways(clips_BTHWC: Array) -> tuple[Array, Array]:
-    """Return the way out and, turned round, the way back, each (B, T // 2, H, W, 3).
+    """Return the way out and the reversed return path, each (B, T // 2, H, W, 3).
 
-    The frame in the middle of an odd number belongs to neither.
+    The middle frame of an odd number of frames belongs to neither.
 
     Args:
-        clips_BTHWC: (B, T, H, W, 3), frame k and frame T − 1 − k from one camera.
+        clips_BTHWC: (B, T, H, W, 3), frames k and T − 1 − k with the same camera.
 
     Raises:
         UserError: there are fewer than 2 frames.
@@ -115,29 +116,29 @@ def ways(clips_BTHWC: Array) -> tuple[Array, Array]:
     clips = jnp.asarray(clips_BTHWC)
     half = clips.shape[1] // 2
     if half < 1:
-        raise UserError("a clip of one frame comes back to nothing: give at least 2 frames.")
+        raise UserError("a clip of one frame has no return path: give at least 2 frames.")
     return clips[:, :half], clips[:, ::-1][:, :half]
 
 
 SIDE = 224
-"""Pixels, height and width, of what DINOv2 is given."""
+"""Height and width of DINOv2's input, pixels."""
 PICTURES = 16
-"""Pictures that are in an encoder at once."""
+"""Images in an encoder at once."""
 SMALL = 1e-12
-"""Added to the product of lengths."""
+"""Added to the product of norms."""
 ENCODERS = ("dinov2", "alex", "vgg")
 _CNNS: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
 
 
 @dataclasses.dataclass(frozen=True)
 class Similarity:
-    """The cosine between features of pictures, times 100; a ``Metric``.
+    """Cosine similarity of image features, times 100; a ``Metric``.
 
     Attributes:
-        encoder: its name, as it stands in the measure's.
-        network: what the encoder is: settings of a DINOv2, or a network of LPIPS.
+        encoder: its name, as used in the metric's name.
+        network: the encoder: settings of a DINOv2, or a network of LPIPS.
         params: its parameters.
-        sha256: hash of the file that they were read from.
+        sha256: hash of the weights file.
     """
 
     encoder: str
@@ -157,7 +158,7 @@ class Similarity:
             clips_BTHWC: (B, T, H, W, 3) colours in [0, 1].
 
         Raises:
-            UserError: the pictures are too small for the encoder.
+            UserError: the images are too small for the encoder.
         """
         if not isinstance(self.network, DINOv2Config):
             lpips.require_size(self.network, *clips_BTHWC.shape[2:4])
@@ -165,21 +166,21 @@ class Similarity:
 
     @property
     def about(self) -> str:
-        """What is measured, for the protocol."""
+        """Return a description for the protocol."""
         if isinstance(self.network, DINOv2Config):
             network = self.network
             what = (
                 f"the class token of DINOv2 ({network.layers} layers of width {network.width}), "
-                f"pictures resized to {SIDE} × {SIDE}"
+                f"images resized to {SIDE} × {SIDE}"
             )
         else:
             name = lpips.NAMES[self.network]
-            what = f"the last layer of LPIPS's {name}, averaged over places, pictures not resized"
+            what = f"the last layer of LPIPS's {name}, averaged over positions, images not resized"
         return f"cosine × 100 between features: {what}"
 
 
 def cosine(a_XF: Array, b_XF: Array) -> Array:
-    """Return the cosine between vectors, times 100, (...,); 0 where a vector is 0.
+    """Return the cosine similarity of vectors, times 100, (...,); 0 where a vector is 0.
 
     Args:
         a_XF: (..., F).
@@ -191,7 +192,7 @@ def cosine(a_XF: Array, b_XF: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _features(network: DINOv2Config | Net, params: Params, clips_BTHWC: Array) -> Array:
-    """Encode colours in [0, 1], a bounded number of pictures at once."""
+    """Encode colours in [0, 1], a bounded number of images at once."""
     clips, frames, *size = clips_BTHWC.shape
 
     def one(picture_HWC: Array) -> Array:
@@ -206,7 +207,7 @@ def _features(network: DINOv2Config | Net, params: Params, clips_BTHWC: Array) -
 
 
 def _side(network: DINOv2Config) -> int:
-    """Return the multiple of the patch that is nearest to 224."""
+    """Return the multiple of the patch size nearest to 224."""
     return max(1, round(SIDE / network.patch)) * network.patch
 
 
@@ -215,23 +216,23 @@ def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
 
     Args:
         encoder: one of ``ENCODERS``.
-        path: of DINOv2 a folder made by ``pewm-jax convert import dinov2``; of the others
-            a file as of LPIPS, by default the installed package's.
+        path: for DINOv2 a folder made by ``pewm-jax convert import dinov2``; for the others a file
+            as for LPIPS, by default the installed package's.
 
     Raises:
-        UserError: there is no such encoder, or its weights are absent or damaged.
+        UserError: there is no such encoder, or its weights are missing or damaged.
     """
     if encoder in _CNNS:
         file = lpips_weights.find(_CNNS[encoder], path)
         net, params = lpips_weights.read(file, _CNNS[encoder])
-        name = marked(net, params, lpips_weights.PUBLISHED[net])
+        name = name_with_hash(net, params, lpips_weights.PUBLISHED[net])
         return Similarity(name, net, jax.device_put(params), _hash(file))
     if encoder != "dinov2":
-        raise UserError(f"there is no encoder {encoder!r}; there is {', '.join(ENCODERS)}.")
+        raise UserError(f"there is no encoder {encoder!r}; choose one of {', '.join(ENCODERS)}.")
     if path is None:
         raise UserError(
-            "DINOv2 needs weights, which come with no package: name a folder made by `pewm-jax "
-            "convert import dinov2`, or take the encoder alex or vgg under its own name."
+            "DINOv2 needs weights, which ship with no package: give a folder made by `pewm-jax "
+            "convert import dinov2`, or use the encoder alex or vgg."
         )
     network, params = dinov2.load(Path(path))
     params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)

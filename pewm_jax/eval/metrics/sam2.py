@@ -1,10 +1,10 @@
-"""SAM 2 as the segmenter of SCS: follows the first frame's masks through a video.
+"""SAM 2 as the segmenter of SCS: propagates the first frame's masks through a video.
 
-The paper (EgoWM, arXiv 2601.15284) clicks on things in the first frame and lets SAM 2 follow them.
-Here the first frame's masks are exact, and SAM 2 is given these. The network is that of
-transformers, on torch (``pip install 'pewm-jax[sam2]'``), its weights a folder of the user's, such
-as a copy of ``facebook/sam2.1-hiera-tiny``. It is SAM 2 that is measured with and not a model of
-the library, so there is no port of it.
+The paper (EgoWM, arXiv 2601.15284) clicks on objects in the first frame and lets SAM 2 track them.
+Here SAM 2 gets the first frame's exact masks. The network is that of transformers, on torch (``pip
+install 'pewm-jax[sam2]'``), with weights in a folder of the user, such as a copy of
+``facebook/sam2.1-hiera-tiny``. SAM 2 is a measuring instrument, not a model of the library, so it
+is not ported to JAX.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.structure import Segmenter
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of ImageNet's colours, by which SAM 2's are normalised."""
+"""Mean and standard deviation of ImageNet's colours, with which SAM 2 normalises its input."""
 KIND = "sam2_video"
-"""What ``config.json`` calls the network that follows masks (``sam2_hiera_*`` of one image does
-not)."""
+"""``model_type`` in ``config.json`` of the video network (``sam2_hiera_*`` is for single
+images)."""
 
 
 def read(folder: str | Path, device: str = "cpu") -> Segmenter:
@@ -32,17 +32,17 @@ def read(folder: str | Path, device: str = "cpu") -> Segmenter:
 
     Args:
         folder: ``config.json`` and ``model.safetensors`` of a ``Sam2VideoModel``.
-        device: of torch, such as ``cuda``.
+        device: torch device, such as ``cuda``.
 
     Raises:
-        UserError: torch or transformers are not installed, or the folder holds no such network.
+        UserError: torch or transformers are not installed, or the folder contains no such network.
     """
     path = Path(folder)
-    again = "name a folder with config.json and model.safetensors of a Sam2VideoModel"
+    again = "give a folder with config.json and model.safetensors of a Sam2VideoModel"
     try:
         settings = json.loads((path / "config.json").read_text("utf-8"))
     except (OSError, ValueError) as error:
-        raise UserError(f"{path} holds no SAM 2 ({error}): {again}.") from None
+        raise UserError(f"{path} contains no SAM 2 ({error}): {again}.") from None
     if not isinstance(settings, dict) or settings.get("model_type") != KIND:
         raise UserError(f"{path / 'config.json'} is not of a {KIND} model: {again}.")
     if not (path / "model.safetensors").is_file():
@@ -52,7 +52,7 @@ def read(folder: str | Path, device: str = "cpu") -> Segmenter:
         network, said = transformers.Sam2VideoModel.from_pretrained(
             path, local_files_only=True, use_safetensors=True, output_loading_info=True
         )
-    except Exception as error:  # noqa: BLE001 - the library raises many kinds
+    except Exception as error:  # noqa: BLE001 - noqa: BLE001 - the library raises many kinds
         raise UserError(f"{path} cannot be read as SAM 2 ({error}): {again}.") from None
     if said["missing_keys"] or said["mismatched_keys"]:
         lacking = sorted(map(str, [*said["missing_keys"], *said["mismatched_keys"]]))
@@ -69,15 +69,15 @@ def read(folder: str | Path, device: str = "cpu") -> Segmenter:
         if not count:
             return masks
         with torch.inference_mode():
-            for number, scores in enumerate(_followed(network, video_THWC, first)):
+            for number, scores in enumerate(_track(network, video_THWC, first)):
                 masks[:, number] = scores > 0
         return masks
 
     return follow
 
 
-def _followed(network: Any, video_THWC: np.ndarray, first_KHW: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield (K, H, W) scores, frame after frame, as its processors prepare and finish them."""
+def _track(network: Any, video_THWC: np.ndarray, first_KHW: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield (K, H, W) scores per frame, with the pre- and postprocessing of its processors."""
     torch, transformers = _libraries()
     device, side = network.device, network.config.prompt_encoder_config.image_size
     height, width = video_THWC.shape[1:3]

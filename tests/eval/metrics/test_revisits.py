@@ -95,15 +95,15 @@ def test_the_cosine_is_of_directions():
 def test_what_cannot_work_is_refused_in_a_sentence(files, monkeypatch, tmp_path):
     truth = walks()
     psnr = metrics.load("mirror[psnr]")
-    with pytest.raises(UserError, match="a floor needs another place: give at least 2 clips"):
+    with pytest.raises(UserError, match="a floor needs a second place: give at least 2 clips"):
         psnr.score(truth[:1], truth[:1])
-    with pytest.raises(UserError, match="a clip of one frame comes back to nothing"):
+    with pytest.raises(UserError, match="a clip of one frame has no return path"):
         psnr(truth[:, :1], truth[:, :1])
     with pytest.raises(UserError, match="cannot be compared"):
         psnr(truth, truth[1:])
     with pytest.raises(UserError, match="too small for LPIPS with AlexNet"):
         metrics.load("src[alex]", files["src[alex]"])(truth[:, :, :30], truth[:, :, :30])
-    with pytest.raises(UserError, match="DINOv2 needs weights, which come with no package"):
+    with pytest.raises(UserError, match="DINOv2 needs weights, which ship with no package"):
         metrics.load("src")
     with pytest.raises(UserError, match="holds no DINOv2"):
         metrics.load("src", tmp_path)
@@ -111,7 +111,7 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, monkeypatch, tmp_path)
         revisits.read_encoder("clip")
     with pytest.raises(UserError, match=r"no metric 'mirror\[fvd\]'"):
         metrics.load("mirror[fvd]")
-    with pytest.raises(UserError, match="psnr is no network and takes no weights"):
+    with pytest.raises(UserError, match="psnr is not a network and takes no weights"):
         metrics.load("mirror[psnr]", tmp_path)
     with pytest.raises(UserError, match="DreamSim needs weights"):
         metrics.load("dreamsim")

@@ -122,7 +122,7 @@ def test_a_report_measures_scs_with_it_where_it_is_named(folder):
     assert measure is not None
     assert measure.name == "SCS[sam2]"
     assert len(measure.sha256) == 64
-    assert about.endswith(f"SAM 2 of {folder} follows the masks.")
+    assert about.endswith(f"SAM 2 of {folder} propagates the masks.")
     video, first = clip(48)
     true = np.repeat(first[:, None], len(video), 1)
     assert measure(video, true, np.ones(len(video), bool)).shape == (2, len(video) - 1)
@@ -131,7 +131,7 @@ def test_a_report_measures_scs_with_it_where_it_is_named(folder):
 
 
 def test_what_is_no_sam_2_is_refused(folder, tmp_path, monkeypatch):
-    with pytest.raises(UserError, match=r"holds no SAM 2.*name a folder"):
+    with pytest.raises(UserError, match=r"contains no SAM 2.*give a folder"):
         sam2.read(tmp_path)
     (tmp_path / "config.json").write_text('{"model_type": "sam2"}')
     with pytest.raises(UserError, match="not of a sam2_video model"):

@@ -16,11 +16,11 @@ from pewm_jax.eval.metrics.structure import (
     average,
     first_visible,
     frames_in_view,
+    object_ids,
     object_masks,
     overlaps,
     scs,
     structural_consistency,
-    things_of,
 )
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.houses.kinds import SHELL, kind_of
@@ -142,7 +142,7 @@ def test_what_is_no_mask_and_no_clip_is_refused():
     with pytest.raises(UserError, match="one bool per frame"):
         scs(squares(), squares(), EVER[:2])
     truth, masks = walk([0, 1])
-    with pytest.raises(UserError, match="has no masks of shape"):
+    with pytest.raises(UserError, match="does not fit masks of shape"):
         structural_consistency(truth[:1], truth, masks, EVER[:2])
     with pytest.raises(UserError, match="instance ids"):
         structure.object_masks(np.zeros((4, 4)))
@@ -203,7 +203,7 @@ def test_walls_stay_visible_after_the_tracked_things_have_left_the_view(turn):
     # The outermost pixel centres of a view of 90 degrees are 87.6 degrees apart.
     np.testing.assert_array_equal(visible, np.arange(13) * TURN < 87)
     np.testing.assert_array_equal(visible, reference(scene, camera, seen.depth_THW))
-    things = things_of({"objects": scene.objects})
+    things = object_ids({"objects": scene.objects})
     assert all(kind_of(scene.objects[thing]) not in SHELL for thing in things)
     masks = object_masks(seen.ids_THW, things)
     left = masks[~masks[:, 5:].any((1, 2, 3))]  # those that are gone from frame 5 on

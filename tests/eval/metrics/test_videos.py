@@ -93,7 +93,7 @@ def test_sets_that_cannot_be_compared_are_refused():
     for distance in (frechet, kernel):
         with pytest.raises(UserError, match=r"shapes \(10, 6\) and \(10, 5\) cannot be compared"):
             distance(truth, truth[:, :5])
-        with pytest.raises(UserError, match=r"sets of 1 and 10 clips have no spread"):
+        with pytest.raises(UserError, match=r"sets of 1 and 10 clips have no covariance"):
             distance(truth[:1], truth)
         with pytest.raises(UserError, match="not finite"):
             distance(np.full_like(truth, np.nan), truth)
@@ -101,7 +101,7 @@ def test_sets_that_cannot_be_compared_are_refused():
         kernel(truth, truth[:9])
     with pytest.raises(UserError, match="two sets of 6 clips cannot be drawn from 10"):
         distance_floor(frechet, truth, 6)
-    with pytest.raises(UserError, match="9 imagined and 10 true clips are not partners"):
+    with pytest.raises(UserError, match="9 imagined and 10 true clips are not pairs"):
         distance_of_halves(frechet, truth[:9], truth)
 
 
