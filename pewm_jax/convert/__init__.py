@@ -1,1 +1,1 @@
-"""Conversion of weights: other people's in, ours out."""
+"""Conversion of weights: import of published checkpoints, and exports."""

@@ -1,19 +1,18 @@
-"""CogVideoX's folders: read a checkpoint, import it, load what was imported, export it again.
+"""CogVideoX folders: read a checkpoint, import it, load the import, export it again.
 
 A pipeline's folder has ``transformer/``, ``vae/`` and ``scheduler/``, each with its JSON settings
-and safetensors, one file or shards. An imported folder has the same parts in our layout::
+and safetensors (one file or shards). An imported folder has the same parts in our layout::
 
     DST/transformer/config.json   weights.safetensors
         vae/config.json           weights.safetensors
         scheduler/config.json
-        text/weights.safetensors  the prompts, encoded (where there is a text encoder)
+        text/weights.safetensors  the encoded prompts (if there is a text encoder)
         base.json                 the three original settings, licence, prompts
 
-``base.json`` holds what converted weights were made from, so that ``export`` can write them as
-diffusers' ``from_pretrained`` loads them. Three kinds of folder can be exported: an import, an
-import that was widened to a world model, and a training run that began from one. Of a world model
-the video model inside is written: the memory blocks and the channels of depth and camera are left
-out.
+``base.json`` describes the origin of the converted weights, so that ``export`` can write them in
+the format of diffusers' ``from_pretrained``. Three kinds of folder can be exported: an import, an
+import widened to a world model, and a training run that started from one. For a world model only
+the video model inside is written, without the memory blocks and the channels of depth and camera.
 """
 
 from __future__ import annotations
@@ -45,12 +44,12 @@ PIPELINES = (
     "CogVideoXVideoToVideoPipeline",
 )
 BASE = "base.json"
-"""What converted weights were made from, beside ``config.json`` or the networks' folders."""
+"""File with the origin of converted weights, beside ``config.json`` or the networks' folders."""
 PARTS = ("transformer", "vae", "scheduler")
 UNSTATED = "not stated in the original folder; ask its source before you redistribute it"
 _CARD = re.compile(r"^(license|license_name|license_link):\s*(\S.*)$", re.MULTILINE)
 _TEXT = ("text_encoder", "tokenizer")
-"""Parts that are not converted, only copied."""
+"""Parts that are copied without conversion."""
 
 
 def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTBackbone, Params]:
@@ -70,16 +69,16 @@ def read_scheduler(folder: str | Path) -> DDPMConfig:
         folder: a diffusers pipeline's folder, or the scheduler's folder in it.
 
     Raises:
-        UserError: a class or setting that is not known.
+        UserError: a class or setting is unknown.
     """
     return schedulers.read(schedulers.COGVIDEOX, folder)
 
 
 def require_pipeline(src: Path) -> None:
-    """Check that a folder holds a CogVideoX pipeline, and no weights that would not be read.
+    """Check that a folder contains a CogVideoX pipeline, and no weights that would be ignored.
 
     Raises:
-        UserError: another pipeline, or weights beside those of its parts (such as a LoRA).
+        UserError: it is another pipeline, or contains further weights (such as a LoRA).
     """
     if not src.is_dir():
         raise UserError(f"{src} is not a folder; give a diffusers pipeline's folder.")
@@ -90,8 +89,8 @@ def require_pipeline(src: Path) -> None:
     unused = [str(path.relative_to(src)) for path in found if path.parent.name not in known]
     if unused:
         raise UserError(
-            f"{src} holds weights that cannot be used: {tree.listing(unused)}; merge a LoRA "
-            "into the transformer first, and move away the rest."
+            f"{src} contains weights that cannot be used: {tree.listing(unused)}; merge a LoRA "
+            "into the transformer first, and move the other files away."
         )
 
 
@@ -99,7 +98,7 @@ def load_transformer(folder: str | Path) -> tuple[DiTBackbone, Params]:
     """Load the transformer of an imported folder.
 
     Raises:
-        UserError: it is absent or damaged.
+        UserError: it is missing or damaged.
     """
     return _load(TRANSFORMER, Path(folder))
 
@@ -138,9 +137,9 @@ def import_pipeline(
 
     Args:
         src: a diffusers pipeline's folder.
-        dst: the folder to make; it must not exist.
-        dtype: of the weights; by default the stored one.
-        prompts: their tokens (L, text_dim) by prompt; empty without a text encoder.
+        dst: the folder to create; it must not exist.
+        dtype: dtype of the weights; by default the stored one.
+        prompts: prompt → tokens (L, text_dim); empty without a text encoder.
         record: the content of ``base.json``.
     """
     with output.new_folder(dst) as folder:
@@ -166,7 +165,7 @@ def describe_base(
     Args:
         src: the pipeline's folder.
         settings: the original settings of ``PARTS``.
-        prompts: the prompts that were encoded, in the order in which they are stored.
+        prompts: the encoded prompts, in the order in which they are stored.
         dtype: the requested dtype, None for the stored one.
     """
     index = src / "model_index.json"
@@ -203,12 +202,12 @@ def load_base(folder: Path) -> dict[str, Any]:
     """Read ``base.json``.
 
     Raises:
-        UserError: it is absent or lacks a part.
+        UserError: it is missing or incomplete.
     """
     path = folder / BASE
     if not path.is_file():
         raise UserError(
-            f"{path} does not exist, so the origin of these weights is unknown; name the "
+            f"{path} does not exist, so the origin of these weights is unknown; give the "
             "imported folder with --base."
         )
     values = sources.read_json(path)
@@ -229,14 +228,14 @@ def export(
 
     Args:
         src: an imported folder, a widened one, or a training run.
-        dst: the folder to make.
-        base_folder: the folder with ``base.json``, by default ``src`` or, of a training run, the
+        dst: the folder to create.
+        base_folder: the folder with ``base.json``; by default ``src`` or, for a training run, the
             folder it started from.
-        dtype: of the tensors; by default that of our weights.
+        dtype: dtype of the tensors; by default that of our weights.
         original: the original pipeline's folder, to copy text encoder and tokenizer from.
 
     Raises:
-        UserError: ``dst`` exists, ``base.json`` is absent, or the weights do not fit it.
+        UserError: ``dst`` exists, ``base.json`` is missing, or the weights do not fit it.
     """
     if not src.is_dir():
         raise UserError(f"{src} is not a folder; give an imported folder or a training run.")
@@ -261,7 +260,7 @@ def export(
 
 
 def _origin(src: Path) -> Path:
-    """Return the folder with ``base.json``: a training run names the folder it started from."""
+    """Return the folder with ``base.json``; for a training run, the folder it started from."""
     seen: list[Path] = []
     here = src
     while not (here / BASE).is_file() and (here / CONFIG).is_file() and here not in seen:

@@ -38,20 +38,20 @@ def config_of(
     """Return the settings of the world model around a video model.
 
     Training and memory are those of the presets ``pewm_2b`` and ``pewm_5b``; clip, codec, backbone
-    and noise are the checkpoint's. Memory blocks are no wider than the transformer asks for.
+    and noise are the checkpoint's. Memory blocks are not wider than the transformer.
 
     Args:
         dit: the video model's transformer.
         vae: its VAE.
         noise: its scheduler.
         size: frames, height and width of a clip; None for the paper's 9 × 512 × 512, or for the
-            size that learned positions are for, where they are used at no other.
-        dtype: of the weights: 16 bits are computed in bfloat16.
+            size of the learned positions if they allow no other.
+        dtype: dtype of the weights; 16-bit weights are computed in bfloat16.
         run: name of the experiment, for the folder of its runs.
-        encoder: the image features that the map keeps, by default the colours of patches.
+        encoder: the image features stored in the map, by default the colours of patches.
 
     Raises:
-        ConfigError: a size that the network cannot take.
+        ConfigError: the network does not support the size.
     """
     usual = dataclasses.astuple(paper.CLIP)[:3]
     if dit.positions == "rope_learned" and dit.learned in ("exact", "reference"):
@@ -75,7 +75,7 @@ def require_size(config: Config) -> None:
     """Check that the transformer's positions cover a clip.
 
     Raises:
-        UserError: they are learned for another size, or end before it.
+        UserError: they are learned for another size, or are too few.
     """
     frames, height, width = config.model.latent_shape
     frames += -frames % config.model.backbone.patch_t
@@ -106,14 +106,14 @@ def import_world(
 
     Args:
         src: a diffusers pipeline's folder.
-        dst: the folder to make.
+        dst: the folder to create.
         config: the world model, from ``config_of``.
         prompt_LC: (L, text_dim) tokens of the prompt, None without a text encoder.
         record: the content of ``base.json``.
-        memory: add memory blocks.
-        encoder: parameters of the map's image encoder, if the settings name one that has any.
-        dtype: of the weights; by default the stored one, and float32 for memory blocks.
-        seed: of the memory blocks.
+        memory: whether to add memory blocks.
+        encoder: parameters of the map's image encoder, if it has any.
+        dtype: dtype of the weights; by default the stored one, and float32 for memory blocks.
+        seed: seed of the memory blocks.
     """
     old = TRANSFORMER.config(record["transformer"], cogvideox.BASE)
     channels = config.model.control.channels(config.model)

@@ -51,7 +51,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     dit = TRANSFORMER.config(settings["transformer"], str(src / "transformer/config.json"))
     vae = VAE.config(settings["vae"], str(src / "vae/config.json"))
     noise = cogvideox.read_scheduler(src)
-    for network in (TRANSFORMER, VAE):  # damaged files are refused before hours of work
+    for network in (TRANSFORMER, VAE):  # check all files before hours of work
         pipeline.specs(network, src, options.dtype)
     config, encoder = _world(options, dit, vae, noise) if options.rgbd else (None, None)
     prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)
@@ -83,7 +83,7 @@ def _world(
     """Return the settings of the world model, and its image encoder if it has one.
 
     Raises:
-        UserError: settings that cannot work, or an encoder that is asked for and not given.
+        UserError: invalid settings, or a required encoder is not given.
     """
     size = (options.frames, options.height, options.width)
     network, params = dinov2_model.load(options.encoder) if options.encoder else (None, None)
@@ -101,35 +101,35 @@ def _world(
     kept = config.model.memory.encoder
     if network and not (isinstance(kept, DINOv2EncoderConfig) and kept.network == network):
         raise UserError(
-            f"{options.config} sets memory.encoder to another one than {options.encoder} of "
-            "--encoder; leave out one of the two."
+            f"{options.config} sets another memory.encoder than {options.encoder} of --encoder; "
+            "omit one of the two."
         )
     if kept.CONVERTED and params is None:
         raise UserError(
-            "memory.encoder of kind dinov2 needs its weights; name the folder of `import dinov2` "
+            "memory.encoder of kind dinov2 needs its weights; give the folder of `import dinov2` "
             "with --encoder."
         )
     return config, params
 
 
 def _with_positions(dit: DiTBackbone, learned: Learned | None) -> DiTBackbone:
-    """Return a transformer with a choice for its learned positions.
+    """Return a transformer with the setting for its learned positions.
 
     Raises:
-        UserError: it has none.
+        UserError: it has no learned positions.
     """
     if learned is None:
         return dit
     if dit.positions != "rope_learned":
         raise UserError(
-            "--positions is about a table of learned positions, and this transformer has none "
-            "(only 5b-I2V has); leave it out."
+            "--positions applies to learned positions, but this transformer has none (only 5b-I2V "
+            "has them); omit it."
         )
     return dataclasses.replace(dit, learned=learned)
 
 
 def _stored_dtype(options: ImportCogVideoX) -> str:
-    """Return the dtype that the transformer's weights will have."""
+    """Return the dtype of the transformer's weights."""
     specs = pipeline.specs(TRANSFORMER, options.src, options.dtype)
     return specs["proj_out/kernel"].dtype.name
 

@@ -2,9 +2,9 @@
 
 A pipeline's folder has ``transformer/``, ``vae/`` and ``scheduler/``. Every tensor of a folder must
 be used. The text encoder (T5) is not converted. If there is one, two prompts are encoded with it:
-the prompt of the videos, and the one that guidance pushes away from. The world model has
-the settings of the preset ``egowm_cosmos2b`` around the checkpoint's networks, and fresh layers for
-the actions, which have no effect until they are trained.
+the prompt of the videos, and the negative prompt for guidance. The world model has the settings of
+the preset ``egowm_cosmos2b`` around the checkpoint's networks, and newly initialized layers for the
+actions, which have no effect until they are trained.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[Cosm
 def write_transformer(
     config: CosmosBackbone, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the transformer as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``.
+    """Write the transformer for diffusers' ``from_pretrained``; see ``pipeline.write``.
 
-    How attention is computed and what is recomputed are not part of it.
+    Settings of the attention implementation and of rematerialization are not written.
     """
     pipeline.write(TRANSFORMER, config, params, folder, dtype)
 
@@ -47,7 +47,7 @@ def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[WanVAECodec,
 def write_vae(
     config: WanVAECodec, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
+    """Write the autoencoder for diffusers' ``from_pretrained``; see ``pipeline.write``."""
     pipeline.write(VAE, config, params, folder, dtype)
 
 
@@ -58,7 +58,7 @@ def read_scheduler(folder: str | Path) -> EDMConfig:
         folder: a diffusers pipeline's folder, or the scheduler's folder in it.
 
     Raises:
-        UserError: a class or setting that is not known.
+        UserError: a class or setting is unknown.
     """
     return schedulers.read(schedulers.COSMOS, folder)
 
@@ -70,14 +70,14 @@ def config_of(
 
     Args:
         src: the pipeline's folder.
-        dst: the folder to be made, whose name the runs have.
-        dtype: of the weights; 16 bits are computed in bfloat16.
+        dst: the folder to create; runs get its name.
+        dtype: dtype of the weights; 16-bit weights are computed in bfloat16.
         clip: frames, height and width.
-        prompt: whether prompts' embeddings are stored.
+        prompt: whether the embeddings of prompts are stored.
 
     Raises:
-        UserError: a network of another class, settings that are not known, or a transformer that is
-            not for video.
+        UserError: a network of another class, unknown settings, or a transformer that is not for
+            video.
         ConfigError: the networks do not fit each other or the clip.
     """
     transformer, vae = (pipeline.read_config(network, src) for network in (TRANSFORMER, VAE))
@@ -87,9 +87,9 @@ def config_of(
     found = transformer.in_channels, transformer.out_channels
     if found != (latents + 1, latents):
         raise UserError(
-            f"The transformer takes {found[0]} channels and gives {found[1]}; one for video takes "
-            f"the {latents} of the autoencoder's latents and 1 that marks given frames: import a "
-            "Video2World checkpoint."
+            f"The transformer has {found[0]} input and {found[1]} output channels; one for video "
+            f"takes the {latents} of the autoencoder's latents and 1 that marks given frames: "
+            "import a Video2World checkpoint."
         )
     precision: Literal["float32", "bfloat16"] = "float32" if dtype == "float32" else "bfloat16"
     return egowm_paper.cosmos_experiment(
@@ -112,19 +112,19 @@ def import_world(
     """Write the folder: ``config.json`` and ``weights.safetensors``.
 
     Args:
-        src: a pipeline's folder as diffusers writes it: transformer/, vae/, scheduler/ and, if
+        src: a pipeline's folder in the layout of diffusers: transformer/, vae/, scheduler/ and, if
             there is one, text_encoder/ with tokenizer/.
-        dst: the folder to make.
-        dtype: of the weights; by default the stored one, and float32 for the actions' layers and
-            the prompts.
+        dst: the folder to create.
+        dtype: dtype of the weights; by default the stored one, and float32 for the actions' layers
+            and the prompts.
         clip: frames, height and width.
-        prompts: the prompt, and the one that guidance pushes away from.
+        prompts: the prompt and the negative prompt.
 
     Returns:
         Whether prompts were encoded.
 
     Raises:
-        UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another kind.
+        UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another type.
         ConfigError: the networks do not fit each other or the clip.
     """
     output.refuse_existing(dst)

@@ -32,16 +32,16 @@ def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Param
 
     Args:
         src: a folder with config.json and safetensors (single or sharded); or a state dict of the
-            original repository, .safetensors or .pth, or the folder that holds this one file.
+            original repository, .safetensors or .pth, or the folder that contains only this file.
             A .pth is read by ``torch.load(weights_only=True)``, which runs no code.
-        dtype: of the parameters; by default the stored one.
+        dtype: dtype of the parameters; by default the stored one.
 
     Returns:
         The configuration, and NumPy parameters for ``pewm_jax.models.dinov2.model``.
 
     Raises:
-        UserError: not DINOv2, a tensor missing, left over or of a wrong shape, a damaged file, or
-            torch is needed and absent.
+        UserError: not DINOv2, a tensor is missing, unexpected or has a wrong shape, a file is
+            damaged, or torch is needed and not installed.
     """
     src = Path(src)
     settings = src / "config.json"
@@ -54,7 +54,7 @@ def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Param
 
 
 def write(config: DINOv2Config, params: Params, dst: Path | str) -> None:
-    """Write a folder {config.json, weights.safetensors} that ``dinov2.load`` reads.
+    """Write a folder {config.json, weights.safetensors} for ``dinov2.load``.
 
     Raises:
         UserError: ``dst`` exists.
@@ -76,8 +76,8 @@ def convert(
 
     Args:
         src: see ``read``.
-        dst: the folder to be made.
-        dtype: of the stored parameters; by default the source's.
+        dst: the folder to create.
+        dtype: dtype of the stored parameters; by default the source's.
         log: called with a line about what was imported.
 
     Raises:
@@ -108,8 +108,8 @@ def open_source(src: Path) -> Source:
         if len(pickled) != 1:
             what = f"several: {tree.listing(p.name for p in pickled)}" if pickled else "none"
             raise UserError(
-                f"{src} should hold one file of weights, .safetensors or .pth, but there are "
-                f"{what}; name the file itself."
+                f"{src} should contain one file of weights, .safetensors or .pth, but there are "
+                f"{what}; give the path of the file itself."
             )
         src = pickled[0]
     if not src.is_file():
@@ -118,7 +118,7 @@ def open_source(src: Path) -> Source:
 
 
 def _unpickled(path: Path) -> Source:
-    """Read a state dict that torch saved; no code in it is executed."""
+    """Read a state dict saved by torch, without executing code in it."""
     try:
         import torch  # noqa: PLC0415 - an extra: only these files need it
     except ImportError:

@@ -1,15 +1,14 @@
-"""A training run → a folder for inference: averaged weights in 16 bits, settings, and a model card.
+"""Export a training run for inference: averaged weights in 16 bits, settings, and a model card.
 
 ::
 
     DST/config.json           the run's settings
-        weights.safetensors   every leaf of the run's weights, floats rounded to bfloat16, or to
-                              float16 if that is asked for
-        base.json             where the run has one: the checkpoint it was made from
-        README.md             the card
+        weights.safetensors   all weights of the run, floats rounded to bfloat16 or float16
+        base.json             the checkpoint the run started from, if any
+        README.md             the model card
 
-``pewm_jax.load(DST)`` returns the leaves as they are stored, which halves the memory;
-the networks compute in ``model.dtype`` all the same, because every layer casts its weights to it.
+``pewm_jax.load(DST)`` returns the leaves in the stored dtype, which halves the memory; the networks
+still compute in ``model.dtype``, because every layer casts its weights to it.
 """
 
 from __future__ import annotations
@@ -42,38 +41,38 @@ from pewm_jax.worlds import rollouts
 CARD = "README.md"
 REPORT = Path("report") / METRICS
 TRAINED_ON = "train"
-"""The split that training reads."""
+"""The training split."""
 
 
 def export(
     run: Path, dst: Path, dtype: str = "bfloat16", *, log: Callable[[str], Any] = print
 ) -> Path:
-    """Write what inference needs of a training run into a new folder.
+    """Write the inference weights and settings of a training run into a new folder.
 
-    The run's weights file already holds the moving average where the run trained and the frozen
-    weights elsewhere. The folder is written under a temporary name and renamed when it is complete.
+    The run's weights file already contains the EMA of trained weights and the frozen
+    weights. The folder is written under a temporary name and renamed when it is complete.
 
     Args:
         run: a run folder made by ``train.py`` (or a converted checkpoint in the same form).
-        dst: the folder to make.
+        dst: the folder to create.
         dtype: ``bfloat16`` or ``float16``.
-        log: called with a line on each step.
+        log: called with a line per step.
 
     Returns:
         ``dst``.
 
     Raises:
-        UserError: ``dst`` exists; or the run is absent, damaged, a policy, or has no weights yet.
+        UserError: ``dst`` exists; or the run is missing, damaged, a policy, or has no weights yet.
     """
     if not run.is_dir():
-        raise UserError(f"{run} is not a folder; name a run made by train.py.")
+        raise UserError(f"{run} is not a folder; give a run made by train.py.")
     with output.new_folder(dst) as folder:
         log(f"reading {run} …")
         config, params = rollouts.load_finished(run)
         if not config.model.EXPORTED:
             raise UserError(
-                f"{run} holds a {kinds.of(config.model).name}, which has no smaller form:"
-                " its config.json and weights.safetensors are what pewm_jax.load reads, copy those."
+                f"{run} contains a {kinds.of(config.model).name}, which has no inference form: copy"
+                " its config.json and weights.safetensors, which pewm_jax.load reads."
             )
         origin = _base(run, config)
         metadata = weights.metadata(run / runs.WEIGHTS)
@@ -99,7 +98,7 @@ def export(
 
 
 def narrow(leaf: Any, dtype: Any = jnp.bfloat16) -> np.ndarray:
-    """Return an array with floats rounded to 16 bits; everything else as it is.
+    """Return an array with floats rounded to 16 bits; other dtypes unchanged.
 
     Raises:
         UserError: a float is beyond the range of float16.
@@ -115,7 +114,7 @@ def narrow(leaf: Any, dtype: Any = jnp.bfloat16) -> np.ndarray:
 
 
 def _write(path: Path, params: Params, metadata: Mapping[str, str], dtype: Any) -> None:
-    """Write the weights leaf by leaf, so that no second copy of them is held."""
+    """Write the weights leaf by leaf, without a second copy in memory."""
     leaves = tree.flatten(params)
     like = {
         name: jax.ShapeDtypeStruct(
@@ -154,17 +153,17 @@ def _metrics(run: Path) -> dict[str, Any] | None:
 
 @dataclasses.dataclass(frozen=True)
 class CardFacts:
-    """What a card is written from.
+    """The contents of a model card.
 
     Attributes:
-        name: its heading.
+        name: name of the model, the heading.
         version: of this library.
         config: the run's settings.
         params: its weights.
-        stage: number of the last finished stage, "0" for converted weights before any training.
-        step: steps of that stage.
-        base: the ``base.json`` of the checkpoint that the run started from, if there is one.
-        metrics: the report of these weights, if there is one.
+        stage: number of the last finished stage, "0" for converted weights before training.
+        step: number of steps of that stage.
+        base: the ``base.json`` of the checkpoint that the run started from, if any.
+        metrics: the report of these weights, if any.
     """
 
     name: str
@@ -218,7 +217,7 @@ def _what(facts: CardFacts) -> str:
         "A persistent embodied world model: given posed RGB-D frames and an agent's actions, it "
         f"imagines what the agent will see, {seen}, in clips of {size}, with {memory}{made_of}."
         f"\n\n{table}\n\n"
-        "Weights are the moving average of training where it trained and the unchanged base "
+        "Weights are the moving average of the trained parameters and the unchanged base weights "
         f"elsewhere, rounded to 16 bits; they compute in {config.model.dtype}. Written by "
         f"pewm_jax {facts.version}."
     )
@@ -246,7 +245,7 @@ Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}
 
 
 def _sampler(model: World) -> str:
-    """Return a sentence on the sampler, with the noise; empty for a world without one."""
+    """Return a sentence on the sampler and the noise; empty for a world without a sampler."""
     names = " ".join(filter(None, (model.facts.noise, model.facts.sampler)))
     return f" Sampling: {names}, {model.sample_steps} steps." if names else ""
 
@@ -254,7 +253,7 @@ def _sampler(model: World) -> str:
 def _data(facts: CardFacts) -> str:
     config = facts.config
     if facts.stage == "0":
-        return "## Data\n\nNone here: see the data of the original."
+        return "## Data\n\nNone: see the data of the original checkpoint."
     name = Path(config.data.path).name
     try:
         manifest = read_manifest(Path(config.data.path) / TRAINED_ON, check_files=False)
@@ -275,7 +274,7 @@ def _training(facts: CardFacts) -> str:
     train = facts.config.train
     head = "## Training\n\n"
     if facts.stage == "0":
-        return head + "None: these are converted weights, before any training."
+        return head + "None: these are converted weights, before training."
     rows = ["| stage | steps | batch | learning rate | what learns |", "|---|---:|---:|---:|---|"]
     for number_, stage, what in (
         (str(stage.number), stage.settings(facts.config), ", ".join(stage.trained))
@@ -298,7 +297,7 @@ def _training(facts: CardFacts) -> str:
 def _scores(metrics: Mapping[str, Any] | None) -> str:
     head = "## Scores\n\n"
     if metrics is None:
-        return head + "None: these weights have no report; `python evaluate.py RUN` makes one."
+        return head + "None: these weights have no report; `python evaluate.py RUN` writes one."
     protocol = metrics["protocol"]
     shown = {
         metric: (heading(metric, protocol), digits)
@@ -337,7 +336,7 @@ def _licence(facts: CardFacts) -> str:
         head += "The image encoder is a converted DINOv2: its weights keep their own licence.\n\n"
     if facts.base is None:
         return head + (
-            "Trained from random weights: whoever trained them chooses a licence and is "
+            "Trained from random weights: the trainer chooses a licence and is "
             "responsible for the data."
         )
     name = facts.base.get("name", "a converted checkpoint")

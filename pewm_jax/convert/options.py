@@ -20,23 +20,23 @@ class ImportCogVideoX:
     """Import a CogVideoX checkpoint in the layout of diffusers.
 
     With --rgbd --camera the patch embedding and the output layer are widened for a world model:
-    depth, the observed frame and the camera come in, depth comes out; --memory adds the blocks
-    that read the map. The result is a folder that `pewm_jax.load` reads and that is trained by its
-    name (`pewm-jax train DST`), with the settings of the presets pewm_2b and pewm_5b. Until then
-    it predicts the colours of the original. Without these flags the networks are only
-    converted to our layout.
+    depth, the observed frame and the camera become inputs, depth becomes an output; --memory adds
+    the blocks that read the map. The result is a folder that `pewm_jax.load` reads and that can be
+    trained by its name (`pewm-jax train DST`), with the settings of the presets pewm_2b and
+    pewm_5b. Before training it predicts the colours of the original. Without these flags the
+    networks are only converted to our layout.
     """
 
     REPEATED: ClassVar[tuple[str, ...]] = ("--prompt",)
-    """Flags of several values that may also be given several times."""
+    """Flags with several values that may also be given several times."""
 
     src: Annotated[Path, tyro.conf.Positional]
     """The pipeline's folder: transformer/, vae/, scheduler/ and, if prompts are to be encoded,
     text_encoder/ and tokenizer/."""
     dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
+    """Folder to create."""
     dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
+    """Store weights in this precision; by default the stored one."""
     prompt: tuple[str, ...] = ("",)
     """Prompts to encode and store, by default the empty one; a world model takes one."""
     rgbd: bool = False
@@ -48,9 +48,9 @@ class ImportCogVideoX:
     frames: int | None = None
     """Frames of the world model's clips: 8k + 1; by default 9, or the size of learned positions."""
     positions: Learned | None = None
-    """What learned positions (5b-I2V) do for clips of other sizes than 49 × 480 × 720:
-    `interpolate` resizes their table, `drop` leaves it out, `reference` puts a fixed sinusoid in
-    its place for other numbers of frames, `exact` refuses. By default `exact`."""
+    """Treatment of learned positions (5b-I2V) for clips of other sizes than 49 × 480 × 720:
+    `interpolate` resizes their table, `drop` removes it, `reference` replaces it with a fixed
+    sinusoid for other numbers of frames, `exact` raises an error. By default `exact`."""
     height: int | None = None
     """Height of its images in pixels; by default 512, or the size of learned positions."""
     width: int | None = None
@@ -68,7 +68,7 @@ class ImportCogVideoX:
         if self.rgbd != self.camera:
             given, lacking = ("rgbd", "camera") if self.rgbd else ("camera", "rgbd")
             raise ConfigError(
-                f"--{given} was given without --{lacking}: a world model takes both depth and "
+                f"--{given} was given without --{lacking}: a world model needs both depth and "
                 f"camera; add --{lacking}."
             )
         if not self.prompt:
@@ -94,25 +94,25 @@ class ImportDINOv2:
     """A folder of transformers (config.json, model.safetensors), or the original repository's
     state dict (.pth or .safetensors)."""
     dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
+    """Folder to create."""
     dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
+    """Store weights in this precision; by default the stored one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportSVD:
-    """Import a checkpoint of Stable Video Diffusion as a world model steered by actions.
+    """Import a checkpoint of Stable Video Diffusion as a world model controlled by actions.
 
-    The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
-    train DST`), with the settings of the preset egowm_svd. Until then actions have no effect.
+    The result is a folder that `pewm_jax.load` reads and that can be trained by its name (`pewm-jax
+    train DST`), with the settings of the preset egowm_svd. Before training, actions have no effect.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
     """The pipeline's folder: unet/, vae/, image_encoder/ and scheduler/."""
     dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
+    """Folder to create."""
     dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
+    """Store weights in this precision; by default the stored one."""
     height: int = 512
     """Height of its images in pixels."""
     width: int = 512
@@ -121,26 +121,27 @@ class ImportSVD:
 
 @dataclasses.dataclass(frozen=True)
 class ImportCosmos2:
-    """Import a checkpoint of Cosmos-Predict2 for video as a world model steered by actions.
+    """Import a checkpoint of Cosmos-Predict2 for video as a world model controlled by actions.
 
-    The result is a folder that `pewm_jax.load` reads and that is trained by its name (`pewm-jax
-    train DST`), with the settings of the preset egowm_cosmos2b. Until then actions have no effect.
+    The result is a folder that `pewm_jax.load` reads and that can be trained by its name (`pewm-jax
+    train DST`), with the settings of the preset egowm_cosmos2b. Before training, actions have no
+    effect.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
     """The pipeline's folder: transformer/, vae/, scheduler/ and, if a prompt is to be encoded,
     text_encoder/ and tokenizer/."""
     dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
+    """Folder to create."""
     dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
+    """Store weights in this precision; by default the stored one."""
     prompt: str = ""
     """Prompt to encode and store; by default the empty one."""
     negative: str = ""
-    """Prompt that guidance pushes away from, if `noise.guidance` is above 1; the reference's
-    pipeline has a long one, which describes bad videos."""
+    """Negative prompt for guidance, if `noise.guidance` is above 1; the reference pipeline has a
+    long one, which describes bad videos."""
     frames: int = 17
-    """Frames of a clip, the observed one among them: 4k + 1."""
+    """Frames of a clip, including the observed one: 4k + 1."""
     height: int = 480
     """Height of its images in pixels."""
     width: int = 640
@@ -149,19 +150,19 @@ class ImportCosmos2:
 
 @dataclasses.dataclass(frozen=True)
 class ExportDiffusers:
-    """Write a folder that the from_pretrained of diffusers loads.
+    """Write a folder for the from_pretrained of diffusers.
 
-    Of a world model only the video model is written: memory blocks and the channels of depth
-    and camera are left out. Text encoder and tokenizer are copied from the original pipeline, or
-    left out.
+    For a world model only the video model is written, without memory blocks and the channels of
+    depth and camera. Text encoder and tokenizer are copied from the original pipeline, or
+    omitted.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
     """An imported folder, a widened one, or a training run that started from one."""
     dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
+    """Folder to create."""
     dtype: Dtype | None = None
-    """Store weights in this precision; by default as they are."""
+    """Store weights in this precision; by default the stored one."""
     base: Path | None = None
     """Folder with base.json; by default SRC, or the folder that the training started from."""
     original: Path | None = None
@@ -180,7 +181,7 @@ class ExportInference:
     src: Annotated[Path, tyro.conf.Positional]
     """A run's folder, made by train.py."""
     dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
+    """Folder to create."""
     dtype: Literal["bfloat16", "float16"] = "bfloat16"
     """Precision of the weights: float16 has smaller rounding errors, bfloat16 a larger range."""
 
@@ -189,20 +190,20 @@ class ExportInference:
 class ExportStableHLO:
     """Export the world model as programs that need jax and NumPy but not this library.
 
-    They are checked by running them in a fresh process.
+    The programs are verified in a fresh process.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
-    """A run's folder with `weights.safetensors`, or that of `export inference`."""
+    """A run's folder with `weights.safetensors`, or a folder of `export inference`."""
     dst: Annotated[Path, tyro.conf.Positional]
-    """Folder to make."""
+    """Folder to create."""
     what: Literal["rollout", "denoise"] = "rollout"
     """`rollout`: start a world and imagine clips; `denoise`: one step of the denoiser."""
     clips: int = 1
-    """Clips that one call of the rollout imagines."""
+    """Number of clips imagined per call of the rollout."""
     frames: int | None = None
-    """Observed frames that a world starts from; by default data.context."""
+    """Number of observed frames from which a world starts; by default data.context."""
     platforms: tuple[str, ...] = stablehlo.PLATFORMS
-    """Platforms that the programs are lowered for."""
+    """Platforms for which the programs are lowered."""
     check: bool = True
     """Run the programs on the CPU afterwards and compare; for a large model this takes long."""

@@ -1,4 +1,4 @@
-"""Atomic folders, progress in megabytes, and libraries that only conversion needs."""
+"""Atomic folders, progress in megabytes, and imports of optional conversion libraries."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _MEGABYTE = 1 << 20
 
 
 def refuse_existing(dst: Path) -> None:
-    """Refuse to write over anything.
+    """Raise an error if a path exists.
 
     Raises:
         UserError: ``dst`` exists.
     """
     if dst.exists() or dst.is_symlink():
-        raise UserError(f"{dst} exists already; name a new folder or remove that one.")
+        raise UserError(f"{dst} exists already; choose a new folder or remove that one.")
 
 
 @contextlib.contextmanager
@@ -46,11 +46,11 @@ def megabytes(label: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show progress in megabytes.
 
     Args:
-        label: what is being done.
-        total: bytes of all of it.
+        label: name of the work.
+        total: total number of bytes.
 
     Yields:
-        A function to call with the number of bytes just done.
+        A function that adds a number of finished bytes.
     """
     done = 0
     with Meter(label, -(-total // _MEGABYTE), "MiB") as meter:
@@ -79,6 +79,6 @@ def convert_extra(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise UserError(
-            f"{name} is needed for this and cannot be imported ({error}); run "
+            f"{name} is needed for this command and cannot be imported ({error}); run "
             "pip install 'pewm-jax[convert]'."
         ) from None

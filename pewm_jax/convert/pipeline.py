@@ -1,11 +1,11 @@
-"""Convert a checkpoint: read, map names by the family's table, change layouts, check, write.
+"""Conversion pipeline: read, map names by the family's table, change layouts, check, write.
 
-A family's table of names is a ``Network`` in ``models/<family>/convert.py``. ``read`` brings a
-published network into our parameter tree and ``write`` brings it back, tensor by tensor and
-strictly: every tensor must be there, be of the right shape and be used. What is expected follows
-from the table and the abstract tree alone, before any weight is read, so a wrong name or shape
-costs no time and no memory. ``write_world`` writes a world model's folder part by part, so that one
-network is in memory at a time. Folders are made whole or not at all (``output.new_folder``).
+A family's table of names is a ``Network`` in ``models/<family>/convert.py``. ``read`` converts a
+published network to our parameter tree and ``write`` converts it back, tensor by tensor and
+strictly: every tensor must exist, have the right shape and be used. Names and shapes are checked
+from the table and the abstract tree before any weight is read, so errors are found early.
+``write_world`` writes a world model's folder part by part, so that one network is in memory at a
+time. Folders are written atomically (``output.new_folder``).
 """
 
 from __future__ import annotations
@@ -30,33 +30,34 @@ from pewm_jax.types import Array, Params
 WEIGHTS = "weights.safetensors"
 CONFIG = "config.json"
 FLOATS = ("float32", "bfloat16", "float16")
-"""The dtypes weights can be converted to, by name."""
+"""Target dtypes of weights, by name."""
 STORED = (*FLOATS, "float64")
-"""The dtypes weights may come in; a table that a network has computed can be float64."""
+"""Supported dtypes of stored weights; a table computed by a network can be float64."""
 Specs = dict[str, jax.ShapeDtypeStruct]
 """Shape and dtype of every leaf, by path."""
 Part = tuple[Specs, Callable[[], Params]]
-"""What a part's parameters are like, and the function that reads or makes them."""
+"""The abstract parameters of a part, and the function that reads or creates them."""
 
 _LISTED = 200
-"""Most names that a message lists: whoever wrote the file needs all of them."""
+"""Largest number of names listed in a message; it is large, because the author of a file needs all
+of them."""
 
 
 def read(network: Network, folder: str | Path, dtype: str | None = None) -> tuple[Any, Params]:
     """Read a published network.
 
     Args:
-        network: which, from ``models.<family>.convert``.
+        network: the network, from ``models.<family>.convert``.
         folder: a pipeline's folder, or the network's folder in it.
-        dtype: of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the stored
-            one.
+        dtype: dtype of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the
+            stored one.
 
     Returns:
         ``(config, params)``, NumPy arrays.
 
     Raises:
-        UserError: a tensor that is missing, left over or of another shape, a damaged file, a
-            class or setting that is not known.
+        UserError: a tensor is missing, unexpected or of another shape, a file is damaged, or a
+            class or setting is unknown.
     """
     config, files = _open(network, Path(folder))
     total = sum(place.size for _, place in files.places.values())
@@ -73,13 +74,13 @@ def read_config(network: Network, folder: str | Path) -> Any:
 
 
 def published_config(network: Network, folder: Path) -> dict[str, Any]:
-    """Read the settings of a network as they were published, and check its class."""
+    """Read the settings of a network in their published form, and check its class."""
     path = sources.component(folder, network.folder) / CONFIG
     return sources.read_config(path, [network.class_name], network.class_key)
 
 
 def specs(network: Network, folder: Path, dtype: str | None = None) -> Specs:
-    """Return shape and dtype of every leaf that ``read`` will give, by path; check the files."""
+    """Return shape and dtype of every leaf that ``read`` will return, by path; check the files."""
     config, files = _open(network, folder)
     entries, like, source = network.entries(config), network.like(config), _used(network, files)
     require(entries, source, like)
@@ -87,23 +88,23 @@ def specs(network: Network, folder: Path, dtype: str | None = None) -> Specs:
 
 
 def part(network: Network, folder: Path, dtype: str | None = None) -> Part:
-    """Return a published network as a part of a world model, to be read when it is written."""
+    """Return a published network as a part of a world model, read lazily when it is written."""
     return specs(network, folder, dtype), lambda: read(network, folder, dtype)[1]
 
 
 def write(
     network: Network, config: Any, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write a network as the library that published it reads it; the inverse of ``read``.
+    """Write a network in the format of the library that published it; the inverse of ``read``.
 
-    Settings that only change how the network is computed are not part of it.
+    Settings that only change how the network is computed are not written.
 
     Args:
-        network: which.
+        network: the network.
         config: our settings.
         params: our parameters.
-        folder: to make.
-        dtype: of the tensors; by default that of the parameters.
+        folder: the folder to create.
+        dtype: dtype of the tensors; by default that of the parameters.
 
     Raises:
         UserError: the folder exists.
@@ -120,14 +121,14 @@ def write_published(
     folder: Path,
     dtype: str | None = None,
 ) -> None:
-    """Write settings as they were published, and weights, into a folder.
+    """Write settings in their published form, and weights, into a folder.
 
     Args:
-        network: which.
-        values: its settings as they were published.
+        network: the network.
+        values: its settings in their published form.
         params: our parameters.
-        folder: to make, or an empty one.
-        dtype: of the tensors; by default that of the parameters.
+        folder: the folder to create, or an empty one.
+        dtype: dtype of the tensors; by default that of the parameters.
     """
     folder.mkdir(parents=True, exist_ok=True)
     output.write_json(folder / CONFIG, values)
@@ -140,20 +141,20 @@ def write_published(
 
 
 def _open(network: Network, folder: Path) -> tuple[Any, sources.Files]:
-    """Return the settings and the files of a network, no weight read yet."""
+    """Return the settings and the files of a network, without reading weights."""
     config = read_config(network, folder)
     return config, sources.open_folder(sources.component(folder, network.folder))
 
 
 def _used(network: Network, files: sources.Files) -> Source:
-    """Return the tensors without those that no network reads."""
+    """Return the tensors, except those that no network uses."""
     if not network.unused:
         return files
     return Renamed(files, {n: (n, 0, 1) for n in files.names() if n not in network.unused})
 
 
 def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:
-    """Return the published names and shapes that the entries ask for, without allocating memory.
+    """Return the published names and shapes of the entries, without allocating memory.
 
     Args:
         entries: the converter's table.
@@ -168,7 +169,7 @@ def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...
     shapes: dict[str, tuple[int, ...]] = {}
     for entry in entries:
         if entry.path not in leaves or entry.name in shapes:
-            raise ValueError(f"the entry of {entry.name} leads to {entry.path}: none or twice")
+            raise ValueError(f"the entry of {entry.name} leads to {entry.path}: missing or twice")
         layers[entry.path].append(entry.layer)
         shape = tuple(leaves[entry.path].shape)
         inner = shape if entry.layer is None else shape[1:]
@@ -179,26 +180,26 @@ def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...
             range(leaf.shape[0] if leaf.ndim else 0)
         )
         if not filled or not whole:
-            raise ValueError(f"{path} is not filled by the entries (layers {filled})")
+            raise ValueError(f"{path} is not covered by the entries (layers {filled})")
     return shapes
 
 
 def require(entries: Sequence[Entry], source: Source, like: Params) -> None:
-    """Check that a source holds exactly the tensors that the entries name, of the right shapes.
+    """Check that a source contains exactly the tensors of the entries, with the right shapes.
 
     Raises:
-        UserError: with the list of tensors that are missing, left over or of another shape.
+        UserError: tensors are missing, unexpected or of another shape; lists them.
     """
     want = expected(entries, like)
     have = set(source.names())
     missing, unused = want.keys() - have, have - want.keys()
     if missing or unused:
         parts = [f"lacks {len(missing)} tensors ({tree.listing(missing, _LISTED)})"] * bool(missing)
-        parts += [f"has {len(unused)} tensors of no use ({tree.listing(unused, _LISTED)})"] * bool(
+        parts += [f"has {len(unused)} unexpected tensors ({tree.listing(unused, _LISTED)})"] * bool(
             unused
         )
         raise UserError(
-            f"{source.where} does not fit its config.json: it {' and '.join(parts)}; are they of "
+            f"{source.where} does not fit its config.json: it {' and '.join(parts)}; are both from "
             "the same network?"
         )
     wrong = [
@@ -208,14 +209,14 @@ def require(entries: Sequence[Entry], source: Source, like: Params) -> None:
     ]
     if wrong:
         raise UserError(
-            f"{source.where} holds tensors of other shapes than its config.json says: "
-            f"{tree.listing(wrong)}; are they of the same network?"
+            f"{source.where} contains tensors of other shapes than its config.json says: "
+            f"{tree.listing(wrong)}; are both from the same network?"
         )
     other = [f"{n} {source.dtype(n)}" for n in want if source.dtype(n).name not in STORED]
     if other:
         raise UserError(
-            f"{source.where} holds {tree.listing(other)}: weights of {', '.join(STORED)} can be "
-            "read; save it in one of these."
+            f"{source.where} contains {tree.listing(other)}: weights of {', '.join(STORED)} are "
+            "supported; save it in one of these."
         )
 
 
@@ -234,9 +235,9 @@ def read_tensors(
         entries: the converter's table.
         source: the published tensors.
         like: our tree, abstract (``jax.eval_shape``) or not: paths and shapes.
-        dtype: of the result, one of ``FLOATS``; by default the stored one (of several in one
-            leaf, the dtype that holds them all).
-        progress: called after every tensor with the bytes just read.
+        dtype: dtype of the result, one of ``FLOATS``; by default the stored one (for several in one
+            leaf, their common dtype).
+        progress: called after every tensor with the number of bytes read.
 
     Returns:
         Nested dictionaries of NumPy arrays.
@@ -252,14 +253,14 @@ def read_tensors(
         place = leaves[entry.path] if entry.layer is None else leaves[entry.path][entry.layer]
         _cast(entry.transform.read(tensor), place, f"{source.where}: {entry.name}")
         progress(tensor.nbytes)
-        del tensor  # before the next one is read
+        del tensor  # free memory before the next one is read
     return tree.unflatten(leaves)
 
 
 def leaf_specs(
     entries: Sequence[Entry], source: Source, like: Params, dtype: str | None = None
 ) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return the shape and dtype of every leaf that ``read_tensors`` will give, by path."""
+    """Return the shape and dtype of every leaf that ``read_tensors`` will return, by path."""
     stored: dict[str, set[np.dtype]] = defaultdict(set)
     for entry in entries:
         stored[entry.path].add(source.dtype(entry.name))
@@ -278,7 +279,7 @@ def write_tensors(
     Args:
         entries: the converter's table.
         params: our tree, NumPy or JAX arrays.
-        dtype: of the tensors; by default that of the leaves.
+        dtype: dtype of the tensors; by default that of the leaves.
 
     Raises:
         UserError: a value too large for float16.
@@ -310,7 +311,7 @@ def published_specs(
 
 
 def _common(dtypes: set[np.dtype]) -> np.dtype:
-    """Return the dtype that holds values of all of them."""
+    """Return the common dtype."""
     if len(dtypes) == 1:
         return next(iter(dtypes))
     return max(np.dtype(np.float32), *dtypes, key=lambda dtype: dtype.itemsize)
@@ -318,18 +319,18 @@ def _common(dtypes: set[np.dtype]) -> np.dtype:
 
 def _dtype(name: str) -> np.dtype:
     if name not in FLOATS:
-        raise UserError(f"There is no dtype {name!r} for weights; there is {', '.join(FLOATS)}.")
+        raise UserError(f"There is no dtype {name!r} for weights; choose from {', '.join(FLOATS)}.")
     return np.dtype(jax.numpy.dtype(name))
 
 
 def _cast(tensor: np.ndarray, out: np.ndarray, where: str) -> None:
-    """Write a tensor into ``out`` in out's dtype, and refuse what float16 cannot hold."""
+    """Write a tensor into ``out`` in out's dtype; raise an error on overflow of float16."""
     narrow = out.dtype == np.float16 and tensor.dtype != np.float16
     with np.errstate(over="ignore") if narrow else contextlib.nullcontext():
         out[...] = tensor
     if narrow and not np.isfinite(out).all():
         raise UserError(
-            f"{where} holds values beyond float16's 65504; use --dtype bfloat16 or float32."
+            f"{where} contains values beyond float16's 65504; use --dtype bfloat16 or float32."
         )
 
 
@@ -339,12 +340,12 @@ def write_world(
     parts: Mapping[str, Part],
     more: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
-    """Write a world model's ``config.json`` and ``weights.safetensors``, whole or not at all.
+    """Write a world model's ``config.json`` and ``weights.safetensors``, atomically.
 
     Args:
-        dst: the folder to make.
+        dst: the folder to create.
         config: the settings.
-        parts: by the names that parameters have in a world model.
+        parts: name in a world model → part.
         more: further JSON files by name.
 
     Raises:
@@ -367,11 +368,11 @@ def write_world(
 
 
 def fresh_actions(config: Config, dtype: str | None) -> Part:
-    """Return fresh layers for the control's actions, which have no effect until they are trained.
+    """Return new layers for the control's actions, which have no effect until they are trained.
 
     Args:
         config: the settings.
-        dtype: of the weights; by default float32.
+        dtype: dtype of the weights; by default float32.
     """
 
     def make() -> Params:
@@ -381,7 +382,7 @@ def fresh_actions(config: Config, dtype: str | None) -> Part:
 
 
 def cast_specs(params: Params, dtype: str | None) -> Specs:
-    """Return what parameters are like in another dtype, by default float32."""
+    """Return abstract parameters in another dtype, by default float32."""
     new = np.dtype(jax.numpy.dtype(dtype or "float32"))
     flat = tree.flatten(params)
     return {path: jax.ShapeDtypeStruct(leaf.shape, new) for path, leaf in flat.items()}

@@ -1,11 +1,11 @@
 """The settings of diffusers' schedulers ↔ our noise settings; schedulers have no weights.
 
-A setting that a file leaves out has the default of the scheduler's class, which is not always what
-the published models use. References, all of diffusers:
+A setting missing in a file has the default of the scheduler's class, which differs in places from
+what the published models use. References, all of diffusers:
 
 - CogVideoX: ``scheduling_ddim_cogvideox.py`` and ``scheduling_dpm_cogvideox.py``.
-- Stable Video Diffusion: ``EulerDiscreteScheduler`` in the one form that this model uses: levels of
-  noise after Karras et al., a continuous time log σ / 4, and predictions of v. This is EDM with
+- Stable Video Diffusion: ``EulerDiscreteScheduler`` in the one form that this model uses: noise
+  levels of Karras et al., a continuous time log σ / 4, and v-prediction. This is EDM with
   ``sigma_data`` 1 and the opposite sign.
 - Cosmos-Predict2: ``FlowMatchEulerDiscreteScheduler`` with Karras' levels, as
   ``Cosmos2VideoToWorldPipeline`` uses it. The pipeline sets the range of levels itself, from 80 to
@@ -34,8 +34,9 @@ class Scheduler:
     Attributes:
         classes: its classes in diffusers.
         read_config: ``(values of scheduler_config.json) -> our settings``.
-        write_config: the inverse. What diffusers has no name for is left out: the number of steps
-            and the guidance, which its pipelines take as arguments, and what only training needs.
+        write_config: the inverse. Settings without an equivalent in diffusers are omitted: the
+            number of steps and the guidance, which its pipelines take as arguments, and settings
+            that only training needs.
     """
 
     classes: tuple[str, ...]
@@ -47,27 +48,28 @@ def read(scheduler: Scheduler, folder: str | Path) -> Any:
     """Read the scheduler of a checkpoint.
 
     Args:
-        scheduler: of which family.
+        scheduler: the family's scheduler.
         folder: a diffusers pipeline's folder, or the scheduler's folder in it.
 
     Raises:
-        UserError: a class or setting that is not known.
+        UserError: a class or setting is unknown.
     """
     return scheduler.read_config(published_config(scheduler, Path(folder)))
 
 
 def published_config(scheduler: Scheduler, folder: Path) -> dict[str, Any]:
-    """Read the scheduler's settings as diffusers wrote them."""
+    """Read the scheduler's settings in diffusers' format."""
     path = sources.component(folder, "scheduler") / "scheduler_config.json"
     return sources.read_config(path, scheduler.classes)
 
 
 COGVIDEOX_CLASSES = {"CogVideoXDDIMScheduler": "ddim", "CogVideoXDPMScheduler": "dpm"}
-"""Their classes and our samplers."""
+"""diffusers' class → our sampler."""
 TARGETS = {"epsilon": "eps", "sample": "x0", "v_prediction": "v"}
-"""Their prediction types and our targets."""
+"""diffusers' prediction type → our target."""
 COGVIDEOX_STEPS = 50
-"""Steps of an imported scheduler: the default of CogVideoX's pipelines; no file states it."""
+"""Steps of an imported scheduler: the default of CogVideoX's pipelines, because no file states
+it."""
 
 _COGVIDEOX_DEFAULTS: dict[str, Any] = {
     "num_train_timesteps": 1000,
@@ -88,7 +90,7 @@ _COGVIDEOX_WITHOUT_EFFECT = {
     "clip_sample_range": 1.0,
     "sample_max_value": 1.0,
 }
-"""Settings that the reference accepts and never reads."""
+"""Settings that the reference accepts but never uses."""
 _KINDS = {
     "num_train_timesteps": int,
     "steps_offset": int,
@@ -107,11 +109,11 @@ def cogvideox_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
         values: the file's content.
 
     Returns:
-        The sampler of equal steps: ``stride`` is ``fixed`` and ``sample_steps`` 50, as in
+        The sampler with the same steps: ``stride`` is ``fixed`` and ``sample_steps`` 50, as in
         CogVideoX's pipelines; settings that are not in the file have our defaults.
 
     Raises:
-        UserError: another class, a setting that does not exist, or a value that is not supported.
+        UserError: another class, an unknown setting, or an unsupported value.
     """
     name = values.get("_class_name")
     if not isinstance(name, str) or name not in COGVIDEOX_CLASSES:
@@ -121,21 +123,21 @@ def cogvideox_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
         )
     known = _COGVIDEOX_DEFAULTS.keys() | _COGVIDEOX_WITHOUT_EFFECT.keys()
     published.require_known(values, "The scheduler", known)
-    given = {key: values.get(key, default) for key, default in _COGVIDEOX_DEFAULTS.items()}
-    _require_supported(given)
+    values = {key: values.get(key, default) for key, default in _COGVIDEOX_DEFAULTS.items()}
+    _require_supported(values)
     ours = {
-        "train_steps": given["num_train_timesteps"],
-        "beta_start": given["beta_start"],
-        "beta_end": given["beta_end"],
-        "snr_shift": given["snr_shift_scale"],
-        "zero_terminal_snr": given["rescale_betas_zero_snr"],
-        "target": TARGETS[given["prediction_type"]],
-        "sample_steps": min(COGVIDEOX_STEPS, given["num_train_timesteps"]),
+        "train_steps": values["num_train_timesteps"],
+        "beta_start": values["beta_start"],
+        "beta_end": values["beta_end"],
+        "snr_shift": values["snr_shift_scale"],
+        "zero_terminal_snr": values["rescale_betas_zero_snr"],
+        "target": TARGETS[values["prediction_type"]],
+        "sample_steps": min(COGVIDEOX_STEPS, values["num_train_timesteps"]),
         "sampler": COGVIDEOX_CLASSES[name],
-        "spacing": given["timestep_spacing"],
-        "steps_offset": given["steps_offset"],
+        "spacing": values["timestep_spacing"],
+        "steps_offset": values["steps_offset"],
         "stride": "fixed",
-        "set_alpha_to_one": given["set_alpha_to_one"],
+        "set_alpha_to_one": values["set_alpha_to_one"],
     }
     try:
         return configuration.from_dict(DDPMConfig, ours, "scheduler")
@@ -144,9 +146,9 @@ def cogvideox_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
 
 
 def cogvideox_to_diffusers(config: DDPMConfig) -> dict[str, Any]:
-    """Write the settings as ``scheduler_config.json`` has them, the inverse of reading.
+    """Return the settings in the format of ``scheduler_config.json``; the inverse of reading.
 
-    Settings without an equivalent are left out: the number of steps and the guidance, which
+    Settings without an equivalent are omitted: the number of steps and the guidance, which
     diffusers' pipelines take as arguments, and those that only training needs.
     """
     names = {ours: theirs for theirs, ours in COGVIDEOX_CLASSES.items()}
@@ -167,24 +169,24 @@ def cogvideox_to_diffusers(config: DDPMConfig) -> dict[str, Any]:
     }
 
 
-def _require_supported(given: Mapping[str, Any]) -> None:
-    """Refuse values that the reference or this library does not support."""
+def _require_supported(values: Mapping[str, Any]) -> None:
+    """Raise an error for values that the reference or this library does not support."""
     for key, value in _COGVIDEOX_FIXED.items():
-        if given[key] != value:
+        if values[key] != value:
             raise UserError(
-                f"The scheduler's {key} is {given[key]!r}; only {value!r} is supported."
+                f"The scheduler's {key} is {values[key]!r}; only {value!r} is supported."
             )
     choices = {
         "prediction_type": tuple(TARGETS),
         "timestep_spacing": ("trailing", "leading", "linspace"),
     }
     for key, known in choices.items():
-        if given[key] not in known:
+        if values[key] not in known:
             raise UserError(
-                f"The scheduler's {key} is {given[key]!r}; supported are {', '.join(known)}."
+                f"The scheduler's {key} is {values[key]!r}; supported are {', '.join(known)}."
             )
     for key, kind in _KINDS.items():
-        value = given[key]
+        value = values[key]
         number = isinstance(value, int) and not isinstance(value, bool)
         fits = number or isinstance(value, float) if kind is float else type(value) is kind
         if not fits:
@@ -196,7 +198,7 @@ def _require_supported(given: Mapping[str, Any]) -> None:
 SVD_CLASS = "EulerDiscreteScheduler"
 """The reference's class."""
 SVD_STEPS = 25
-"""Steps of an imported scheduler: the default of the pipeline; no file states it."""
+"""Steps of an imported scheduler: the default of the pipeline, because no file states it."""
 RHO = 7.0
 """Exponent of the levels; the reference has no setting for it."""
 _SVD_ONLY: dict[str, tuple[Any, Any]] = {
@@ -208,7 +210,7 @@ _SVD_ONLY: dict[str, tuple[Any, Any]] = {
     "use_beta_sigmas": (False, False),
     "final_sigmas_type": ("zero", "zero"),
 }
-"""Settings of which one value is supported: that value, and diffusers' default."""
+"""Settings with one supported value: that value, and diffusers' default."""
 _SVD_WITHOUT_EFFECT = {
     "num_train_timesteps": 1000,
     "beta_start": 0.00085,
@@ -219,9 +221,9 @@ _SVD_WITHOUT_EFFECT = {
     "steps_offset": 1,
     "rescale_betas_zero_snr": False,
 }
-"""Settings that the levels do not depend on, and what is written for them."""
+"""Settings that do not affect the levels, and the values written for them."""
 _SVD_FORMER = ("clip_sample", "set_alpha_to_one", "skip_prk_steps")
-"""Settings that the published file has and the reference never reads."""
+"""Settings of the published file that the reference never uses."""
 
 
 def svd_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
@@ -231,11 +233,11 @@ def svd_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
         values: the file's content.
 
     Returns:
-        The sampler of equal steps, 25 of them; settings that are not in the file, such as the noise
-        in training, has our defaults.
+        The sampler with the same steps, 25 of them; settings that are not in the file, such as the
+        noise in training, have our defaults.
 
     Raises:
-        UserError: another class, a setting that does not exist, or a value that is not supported.
+        UserError: another class, an unknown setting, or an unsupported value.
     """
     name = values.get("_class_name")
     if name != SVD_CLASS:
@@ -263,13 +265,13 @@ def svd_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
 
 
 def svd_to_diffusers(config: EDMConfig) -> dict[str, Any]:
-    """Write the settings as ``scheduler_config.json`` has them, the inverse of reading.
+    """Return the settings in the format of ``scheduler_config.json``; the inverse of reading.
 
-    The number of steps, the guidance and the noise in training are left out: diffusers has no
+    The number of steps, the guidance and the noise in training are omitted: diffusers has no
     settings for them.
 
     Raises:
-        UserError: a setting that the reference does not have.
+        UserError: a setting has no equivalent in the reference.
     """
     wanted = {"target": "v", "sigma_data": 1.0, "rho": RHO, "sampler": "euler"}
     for key, only in wanted.items():
@@ -290,7 +292,7 @@ COSMOS_CLASS = "FlowMatchEulerDiscreteScheduler"
 """The reference's class."""
 WHAT = "The scheduler"
 COSMOS_STEPS = 35
-"""Steps of an imported scheduler: the default of the pipeline; no file states it."""
+"""Steps of an imported scheduler: the default of the pipeline, because no file states it."""
 _COSMOS_OURS: dict[str, Any] = {
     "target": "flow",
     "sigma_data": 1.0,
@@ -313,7 +315,7 @@ _COSMOS_ONLY: dict[str, tuple[Any, Any]] = {
     "sigma_data": (1.0, 1.0),
     "final_sigmas_type": ("sigma_min", "sigma_min"),
 }
-"""Settings of which one value is supported: that value, and the default of an absent one."""
+"""Settings with one supported value: that value, and the default of a missing one."""
 _COSMOS_WITHOUT_EFFECT: dict[str, Any] = {
     "num_train_timesteps": 1000,
     "shift": 1.0,
@@ -323,7 +325,7 @@ _COSMOS_WITHOUT_EFFECT: dict[str, Any] = {
     "max_image_seq_len": 4096,
     "time_shift_type": "exponential",
 }
-"""Settings that Karras' levels do not depend on, and what is written for them."""
+"""Settings that do not affect Karras' levels, and the values written for them."""
 
 
 def cosmos_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
@@ -333,26 +335,27 @@ def cosmos_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
         values: the file's content.
 
     Returns:
-        The sampler of equal steps, 35 of them; settings that are not in the file, such as the noise
-        in training, has our defaults. The pipeline's ``guidance_scale`` g is ``guidance`` 1 + g.
+        The sampler with the same steps, 35 of them; settings that are not in the file, such as the
+        noise in training, have our defaults. The pipeline's ``guidance_scale`` g is ``guidance``
+        1 + g.
 
     Raises:
-        UserError: another class, a setting that does not exist, or a value that is not supported.
+        UserError: another class, an unknown setting, or an unsupported value.
     """
     defaults = {key: default for key, (_, default) in _COSMOS_ONLY.items()}
-    given = published.read_settings(values, WHAT, COSMOS_CLASS, defaults, _COSMOS_WITHOUT_EFFECT)
-    published.require_only(given, WHAT, {key: only for key, (only, _) in _COSMOS_ONLY.items()})
+    values = published.read_settings(values, WHAT, COSMOS_CLASS, defaults, _COSMOS_WITHOUT_EFFECT)
+    published.require_only(values, WHAT, {key: only for key, (only, _) in _COSMOS_ONLY.items()})
     return EDMConfig(**_COSMOS_OURS, sample_steps=COSMOS_STEPS)
 
 
 def cosmos_to_diffusers(config: EDMConfig) -> dict[str, Any]:
-    """Write the settings as ``scheduler_config.json`` has them, the inverse of reading.
+    """Return the settings in the format of ``scheduler_config.json``; the inverse of reading.
 
-    The number of steps, the guidance and the noise in training are left out: diffusers has no
+    The number of steps, the guidance and the noise in training are omitted: diffusers has no
     settings for them.
 
     Raises:
-        UserError: a setting that the pipeline does not have.
+        UserError: a setting has no equivalent in the pipeline.
     """
     for key, only in {**_COSMOS_OURS, "sampler": "euler"}.items():
         if getattr(config, key) != only:

@@ -1,16 +1,16 @@
-"""A run → programs that run without this library: StableHLO, serialised by ``jax.export``.
+"""Export a run as programs that run without this library: StableHLO, serialised by ``jax.export``.
 
 ::
 
     DST/start.jaxexport       frames → the state of a world          (with what = rollout)
         rollout.jaxexport     state, actions, key → state, frames    (with what = rollout)
         denoise.jaxexport     one evaluation of the denoiser         (with what = denoise)
-        weights.safetensors   the run's weights, as they are
+        weights.safetensors   the run's weights, unchanged
         signature.json        names, shapes and dtypes of all inputs and outputs
         run.py, README.md     how to call them, with jax and three small packages
 
-Weights are arguments, not constants: the programs stay small, both share one file of weights, and
-weights that were trained further fit the same programs. Attention is lowered in its plain form,
+Weights are arguments, not constants: the programs stay small, all share one weights file, and
+weights that are trained further fit the same programs. Attention is lowered in its plain form,
 which runs on every platform; cuDNN's kernel exists on one platform and its custom calls are not
 stable. State, frames and cameras are flat named arrays, so no class of this library is needed.
 """
@@ -50,7 +50,7 @@ from pewm_jax.types import Params
 from pewm_jax.worlds import rollouts
 
 PLATFORMS = ("cpu", "cuda", "tpu")
-"""The platforms that a program is lowered for, as far as it can be."""
+"""The platforms for which a program is lowered, if possible."""
 SIGNATURE, SCRIPT = "signature.json", "run.py"
 TOLERANCE = {"float32": 1e-3, "bfloat16": 3e-2}
 """Largest difference from the library, relative to the largest value, by model.dtype."""
@@ -70,24 +70,24 @@ def export(
     """Write programs that run without this library into a new folder.
 
     Args:
-        run: a run's folder with ``weights.safetensors``, or that of ``export inference``, which has
-            the smaller weights.
-        dst: the folder to make.
-        what: ``rollout``, which also starts a world from frames; or one evaluation of the
-            denoiser.
-        clips: clips that one call of the rollout imagines.
-        frames: observed frames that a world starts from; by default ``data.context``.
-        platforms: from ``PLATFORMS``; those that a program cannot be lowered for are left out.
-        check: run the programs on the CPU, in a fresh process from which this library cannot be
-            imported, and compare with the library. For a large model this takes long.
-        log: called with a line on each step.
+        run: a run's folder with ``weights.safetensors``, or a folder of ``export inference``, which
+            has smaller weights.
+        dst: the folder to create.
+        what: ``rollout``, which also includes the start of a world from frames; or ``denoise``, one
+            evaluation of the denoiser.
+        clips: number of clips imagined per call of the rollout.
+        frames: number of observed frames from which a world starts; by default ``data.context``.
+        platforms: from ``PLATFORMS``; those for which a program cannot be lowered are skipped.
+        check: whether to run the programs on the CPU, in a fresh process in which this library
+            cannot be imported, and compare with the library. For a large model this takes long.
+        log: called with a line per step.
 
     Returns:
         ``dst``.
 
     Raises:
-        UserError: ``dst`` exists; the run is absent or damaged; a count or platform that does not
-            exist; or the check fails.
+        UserError: ``dst`` exists; the run is missing or damaged; a count or platform is invalid; or
+            the check fails.
     """
     _require_sensible(run, clips, frames, platforms)
     with output.new_folder(dst) as folder:
@@ -106,9 +106,9 @@ def export(
         for name, program in programs.items():
             log(f"lowering {name} for {', '.join(platforms)} …")
             exported = lower(program, weights, platforms)
-            left_out = [p for p in platforms if p not in exported.platforms]
-            if left_out:
-                log(f"{name} cannot be lowered for {', '.join(left_out)}: left out.")
+            skipped = [p for p in platforms if p not in exported.platforms]
+            if skipped:
+                log(f"{name} cannot be lowered for {', '.join(skipped)}: skipped.")
             (folder / f"{name}.jaxexport").write_bytes(_serialize(exported))
             entries[name] = _entry(name, program, exported)
         shutil.copyfile(run / runs.WEIGHTS, folder / runs.WEIGHTS)
@@ -132,7 +132,7 @@ def export(
 def verify(folder: Path, programs: dict[str, Program], params: Params, tolerance: float) -> float:
     """Run ``run.py`` in a fresh process without this library and compare with the library.
 
-    Both run on the CPU, with the inputs that ``run.py`` makes up.
+    Both run on the CPU, with the random inputs of ``run.py``.
 
     Returns:
         The largest difference, relative to the largest value of its array.
@@ -155,7 +155,7 @@ def verify(folder: Path, programs: dict[str, Program], params: Params, tolerance
             check=False,
         )
         if done.returncode:
-            last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+            last = (done.stderr.strip().splitlines() or ["no output"])[-1]
             raise UserError(f"The exported programs do not run in a fresh process: {last}")
         got = dict(np.load(out))
     signature = json.loads((folder / SIGNATURE).read_text("utf-8"))
@@ -176,7 +176,7 @@ def verify(folder: Path, programs: dict[str, Program], params: Params, tolerance
 def difference(got: np.ndarray, want: np.ndarray) -> float:
     """Return max |got − want| / max |want|, over the values that are finite in ``want``.
 
-    Infinite values must be equal; infinity is returned where they or the shapes are not.
+    Infinite values must be equal; returns infinity if they or the shapes differ.
     """
     if got.shape != want.shape or got.dtype != want.dtype:
         return float("inf")
@@ -225,14 +225,14 @@ def _actions(config: Config) -> dict[str, list[float]]:
 
 def _require_sensible(run: Path, clips: int, frames: int | None, platforms: Sequence[str]) -> None:
     if not run.is_dir():
-        raise UserError(f"{run} is not a folder; name a run made by train.py.")
+        raise UserError(f"{run} is not a folder; give a run made by train.py.")
     for name, count in (("clips", clips), ("frames", 1 if frames is None else frames)):
         if count < 1:
             raise UserError(f"{name} is {count}: use at least 1.")
     unknown = [name for name in platforms if name not in PLATFORMS]
     if unknown or not platforms:
         raise UserError(
-            f"There is no platform {', '.join(unknown) or 'given'}; there is "
+            f"There is no platform {', '.join(unknown) or 'given'}; choose from "
             f"{', '.join(PLATFORMS)}."
         )
 

@@ -1,4 +1,4 @@
-"""The programs of a StableHLO export: functions of flat named arrays, and how they are lowered."""
+"""The programs of a StableHLO export: functions of flat named arrays, and their lowering."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Program:
     """One function to be exported.
 
     Attributes:
-        meaning: a line on what it does.
+        meaning: a one-line description.
         function: ``(weights, inputs) -> outputs``, all flat named arrays.
         inputs: the inputs' shapes and dtypes.
     """
@@ -45,30 +45,30 @@ def rollout_programs(config: Config, params: Params, frames: int, clips: int) ->
 
     Args:
         config: the experiment.
-        params: its weights; only their paths and shapes matter.
-        frames: observed frames that a world begins with.
-        clips: clips that one call imagines.
+        params: its weights; only their paths and shapes are used.
+        frames: number of observed frames from which a world starts.
+        clips: number of clips imagined per call.
     """
     clip = config.model.clip
     observed = abstract.frames(frames, height=clip.height, width=clip.width)
     state = jax.eval_shape(lambda p, f: worlds.start(config, p, f), params, observed)
 
     def start(weights: Arrays, inputs: Arrays) -> Arrays:
-        (given,) = _pack({"frames": observed}, inputs)
-        return _name(state=worlds.start(config, tree.unflatten(weights), given))
+        (packed,) = _pack({"frames": observed}, inputs)
+        return _name(state=worlds.start(config, tree.unflatten(weights), packed))
 
     def rollout(weights: Arrays, inputs: Arrays) -> Arrays:
-        (given,) = _pack({"state": state}, inputs)
+        (packed,) = _pack({"state": state}, inputs)
         key = jax.random.wrap_key_data(inputs["key"], impl="threefry2x32")
         world = tree.unflatten(weights)
-        after, imagined = worlds.imagine(config, world, given, inputs["actions"], key)
+        after, imagined = worlds.imagine(config, world, packed, inputs["actions"], key)
         return _name(state=after, imagined=imagined)
 
     moves = jax.ShapeDtypeStruct((clips * (clip.frames - 1), 3), jnp.float32)
     key = jax.ShapeDtypeStruct((2,), jnp.uint32)
     return {
         "start": Program(
-            "begins a world from posed RGB-D frames, the last of which is the present one",
+            "starts a world from posed RGB-D frames, the last of which is the present one",
             start,
             _name(frames=observed),
         ),
@@ -86,8 +86,8 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
 
     Args:
         config: the experiment.
-        params: its weights; only their paths and shapes matter.
-        batch: clips at once.
+        params: its weights; only their paths and shapes are used.
+        batch: number of clips.
     """
     model = config.model
     clip = model.clip
@@ -115,9 +115,9 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
     noisy = like((*model.latent_shape, model.codec.channels))
 
     def denoise(weights: Arrays, inputs: Arrays) -> Arrays:
-        given = dict(zip(parts, _pack(parts, inputs), strict=True))
-        conditioning = given.pop("conditioning")
-        readout = MemoryReadout(**given) if given else None
+        packed = dict(zip(parts, _pack(parts, inputs), strict=True))
+        conditioning = packed.pop("conditioning")
+        readout = MemoryReadout(**packed) if packed else None
         noisy, times = inputs["noisy_BthwC"], inputs["timesteps_B"]
         world = tree.unflatten(weights)
         out = world_model.apply(model, world, noisy, conditioning, times, readout)
@@ -136,15 +136,15 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
 
 
 def lower(program: Program, weights: Arrays, platforms: Sequence[str]) -> jax.export.Exported:
-    """Lower a program for every platform for which that is possible.
+    """Lower a program for every platform that supports it.
 
     Args:
         program: what to lower.
         weights: its weights, flat.
-        platforms: where it shall run.
+        platforms: the requested platforms.
 
     Raises:
-        UserError: it cannot be lowered for any.
+        UserError: it cannot be lowered for any platform.
     """
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype), weights)
     function = jax.jit(program.function)
@@ -166,7 +166,7 @@ def lower(program: Program, weights: Arrays, platforms: Sequence[str]) -> jax.ex
         if not names:
             raise UserError(
                 f"This model cannot be lowered for {', '.join(platforms)} "
-                f"({str(error).splitlines()[0]}); name other platforms."
+                f"({str(error).splitlines()[0]}); choose other platforms."
             ) from None
         return attempt(names)
 

@@ -1,8 +1,8 @@
 """Run an exported world model without any model code.
 
-It takes ``pip install jax numpy safetensors flatbuffers``::
+Requires ``pip install jax numpy safetensors flatbuffers``::
 
-    python run.py                                   # made-up frames: shows that it runs
+    python run.py                                   # random frames: shows that it runs
     python run.py --inputs mine.npz --out out.npz   # arrays by the names in signature.json
 
 From Python::
@@ -12,8 +12,9 @@ From Python::
     model = run.Model(".")
     values = model({"frames/rgb_THWC": …, …, "actions": …, "key": run.key(0)})
 
-Programs are called in the order of signature.json; what one returns, the next may take. To go on
-from where a rollout ended, call ``model.programs["rollout"]`` with the returned ``state/…``.
+Programs are called in the order of signature.json; the outputs of one are inputs of the next. To
+continue from the end of a rollout, call ``model.programs["rollout"]`` with the returned
+``state/…``.
 """
 
 import argparse
@@ -28,7 +29,7 @@ from safetensors.flax import load_file
 
 
 class Model:
-    """The programs of a folder, each compiled when it is first called.
+    """The programs of a folder, each compiled on its first call.
 
     Attributes:
         signature: the content of signature.json.
@@ -46,7 +47,7 @@ class Model:
         }
 
     def __call__(self, values):
-        """Call every program in order; returns all that they returned."""
+        """Call every program in order and return all their outputs."""
         returned = {}
         for program in self.programs.values():
             returned.update(program({**values, **returned}))
@@ -60,7 +61,7 @@ class Model:
             for item in entry["inputs"]:
                 name, shape = item["name"], tuple(item["shape"])
                 if name not in values:
-                    raise SystemExit(f"error: {name} {shape} {item['dtype']} is not given.")
+                    raise SystemExit(f"error: {name} {shape} {item['dtype']} is missing.")
                 inputs[name] = np.asarray(values[name], item["dtype"])
                 if inputs[name].shape != shape:
                     got = inputs[name].shape
@@ -71,12 +72,12 @@ class Model:
 
 
 def key(seed):
-    """Return the key of a seed: the randomness of sampling."""
+    """Return the PRNG key of a seed, for sampling."""
     return np.array([0, seed], np.uint32)
 
 
 def example(signature, seed=0):
-    """Make up inputs: noise for pictures, walls two metres away, a camera at the origin."""
+    """Return synthetic inputs: noise images, walls two metres away, a camera at the origin."""
     rng = np.random.default_rng(seed)
     values, returned = {}, set()
     for entry in signature["programs"].values():
@@ -105,28 +106,28 @@ def _made_up(rng, item):
 
 
 def main():
-    """Run the programs on given or made-up inputs."""
+    """Run the programs on given or synthetic inputs."""
     parser = argparse.ArgumentParser(description="Run an exported world model.")
     parser.add_argument("--inputs", help="npz file of inputs, by the names in signature.json")
-    parser.add_argument("--out", help="npz file to write what the programs return")
-    given = parser.parse_args()
+    parser.add_argument("--out", help="npz file for the outputs of the programs")
+    arguments = parser.parse_args()
     model = Model(Path(__file__).parent)
     for name, entry in model.signature["programs"].items():
         print(f"{name}: {entry['meaning']}")
         for way in ("inputs", "outputs"):
             for item in entry[way]:
                 print(f"  {way[:-1]:<7} {item['name']} {item['dtype']} {tuple(item['shape'])}")
-    values = dict(np.load(given.inputs)) if given.inputs else example(model.signature)
+    values = dict(np.load(arguments.inputs)) if arguments.inputs else example(model.signature)
     began = time.perf_counter()
     returned = {name: np.asarray(value) for name, value in model(values).items()}
     print(f"ran in {time.perf_counter() - began:.1f} s, compiling included, {jax.devices()[0]}")
     for name, value in returned.items():
         if np.issubdtype(value.dtype, np.floating) and value.size:
             print(f"  {name}: {value.min():.4g} to {value.max():.4g}")
-    if given.out:
-        with Path(given.out).open("wb") as file:
+    if arguments.out:
+        with Path(arguments.out).open("wb") as file:
             np.savez(file, allow_pickle=False, **returned)
-        print(f"wrote {given.out}")
+        print(f"wrote {arguments.out}")
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
 A pipeline's folder has ``unet/``, ``vae/``, ``image_encoder/`` and ``scheduler/``. Every tensor of
 a folder must be used. The world model has the settings of the preset ``egowm_svd`` around the
-checkpoint's networks, and fresh layers for the actions, which have no effect until they are
-trained.
+checkpoint's networks, and newly initialized layers for the actions, which have no effect until they
+are trained.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetBack
 def write_unet(
     config: SVDUNetBackbone, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the U-Net as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
+    """Write the U-Net for diffusers' ``from_pretrained``; see ``pipeline.write``."""
     pipeline.write(UNET, config, params, folder, dtype)
 
 
@@ -44,7 +44,7 @@ def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[SVDVAECodec,
 def write_vae(
     config: SVDVAECodec, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the autoencoder as diffusers' ``from_pretrained`` reads it; see ``pipeline.write``."""
+    """Write the autoencoder for diffusers' ``from_pretrained``; see ``pipeline.write``."""
     pipeline.write(VAE, config, params, folder, dtype)
 
 
@@ -58,7 +58,7 @@ def read_image_encoder(
 def write_image_encoder(
     config: CLIPVisionConfig, params: Params, folder: str | Path, dtype: str | None = None
 ) -> None:
-    """Write the image encoder as transformers' ``from_pretrained`` reads it."""
+    """Write the image encoder for transformers' ``from_pretrained``."""
     pipeline.write(IMAGE_ENCODER, config, params, folder, dtype)
 
 
@@ -69,7 +69,7 @@ def read_scheduler(folder: str | Path) -> EDMConfig:
         folder: a diffusers pipeline's folder, or the scheduler's folder in it.
 
     Raises:
-        UserError: a class or setting that is not known.
+        UserError: a class or setting is unknown.
     """
     return schedulers.read(schedulers.SVD, folder)
 
@@ -79,12 +79,12 @@ def config_of(src: Path, dst: Path, dtype: str | None, size: tuple[int, int]) ->
 
     Args:
         src: the pipeline's folder.
-        dst: the folder to be made, whose name the runs have.
-        dtype: of the weights; 16 bits are computed in bfloat16.
+        dst: the folder to create; runs get its name.
+        dtype: dtype of the weights; 16-bit weights are computed in bfloat16.
         size: height and width of a frame.
 
     Raises:
-        UserError: a network of another class, or settings that are not known.
+        UserError: a network of another class, or unknown settings.
         ConfigError: the networks do not fit each other or the size.
     """
     unet, vae, encoder = (
@@ -107,13 +107,13 @@ def import_world(
     """Write the folder: ``config.json`` and ``weights.safetensors``.
 
     Args:
-        src: a pipeline's folder as diffusers writes it: unet/, vae/, image_encoder/, scheduler/.
-        dst: the folder to make.
-        dtype: of the weights; by default the stored one, and float32 for the actions' layers.
+        src: a pipeline's folder in diffusers' layout: unet/, vae/, image_encoder/, scheduler/.
+        dst: the folder to create.
+        dtype: dtype of the weights; by default the stored one, and float32 for the actions' layers.
         size: height and width of a frame.
 
     Raises:
-        UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another kind.
+        UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another type.
         ConfigError: the networks do not fit each other or the size.
     """
     output.refuse_existing(dst)

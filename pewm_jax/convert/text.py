@@ -1,7 +1,8 @@
-"""Encode prompts with a pipeline's text encoder, once, at conversion: T5 is not run afterwards.
+"""Encode prompts with a pipeline's text encoder, once, at conversion: T5 is not needed afterwards.
 
-As the reference pipelines do: padded with the pad token to the text length and cut there. For
-CogVideoX no mask is given to the encoder; for Cosmos one is, and the tokens of padding are zeros.
+As in the reference pipelines, prompts are padded with the pad token to the text length and
+truncated there. For CogVideoX the encoder gets no mask; for Cosmos it gets one, and the tokens of
+padding are zeros.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ def encode(
         masked: whether padding is masked in the encoder, and its tokens are zeros (Cosmos).
 
     Returns:
-        The tokens (L, width) in float32 by prompt; empty where the folder has no text encoder.
+        The tokens (L, width) in float32 by prompt; empty if the folder has no text encoder.
 
     Raises:
-        UserError: only one of the two folders, a file that cannot be used, another width, or the
+        UserError: only one of the two folders exists, a file is unusable, the width differs, or the
             libraries are not installed.
     """
     encoder, tokenizer = src / "text_encoder", src / "tokenizer"
@@ -45,10 +46,10 @@ def encode(
     values = sources.read_config(encoder / "config.json", ["t5"], "model_type")
     if values.get("d_model") != width:
         raise UserError(
-            f"{encoder}/config.json has d_model {values.get('d_model')} and the transformer takes "
-            f"text of {width} channels; they are not of the same pipeline."
+            f"{encoder}/config.json has d_model {values.get('d_model')} but the transformer takes "
+            f"text of {width} channels; they are not from the same pipeline."
         )
-    sources.open_folder(encoder)  # refuses an incomplete or damaged folder
+    sources.open_folder(encoder)  # raises an error for an incomplete or damaged folder
     return _encode(encoder, tokenizer, prompts, length, masked=masked)
 
 
@@ -69,7 +70,7 @@ def _encode(
     wrong = {*report["missing_keys"], *report["unexpected_keys"]}
     if wrong:
         raise UserError(
-            f"{encoder} does not hold a T5 encoder: missing or unused are "
+            f"{encoder} does not contain a T5 encoder: missing or unused are "
             f"{tree.listing(map(str, wrong))}."
         )
     out: dict[str, np.ndarray] = {}

@@ -1,11 +1,10 @@
-"""From a video model to a world model: more channels at both ends of the transformer, and back.
+"""Widen a video model to a world model: more channels at both ends of the transformer, and back.
 
 The paper extends the patch embedding to accept depth, the observed frame and the camera, and the
-output layer to give depth. Old weights are copied and the weights of new inputs are zero, so the
-network predicts the original's colours for any value of the new inputs. New outputs
-start at zero too. Channels of the world model, in order: noisy colour, noisy depth, observed
-colour, observed depth, camera; an image-to-video model's image channels become the observed
-colour.
+output layer to predict depth. Old weights are copied and the weights of new inputs are zero, so the
+network predicts the original's colours for any value of the new inputs. New outputs are initialized
+to zero, too. Channels of the world model, in order: noisy colour, noisy depth, observed colour,
+observed depth, camera; an image-to-video model's image channels become the observed colour.
 """
 
 from __future__ import annotations
@@ -47,13 +46,14 @@ def plan(old: DiTBackbone, latents: int, camera: int) -> Widening:
         camera: camera channels at the latent rate.
 
     Raises:
-        UserError: the transformer takes or gives another number of channels.
+        UserError: the transformer has another number of input or output channels.
     """
     if old.out_channels != latents or old.in_channels not in (latents, 2 * latents):
         raise UserError(
-            f"The transformer takes {old.in_channels} channels and gives {old.out_channels}; with "
-            f"a VAE of {latents} it must take {latents} (text to video) or {2 * latents} (image to "
-            f"video) and give {latents}."
+            f"The transformer has {old.in_channels} input and {old.out_channels} output channels; "
+            f"with a VAE of {latents} it must have {latents} (text to video) or {2 * latents} "
+            "(image "
+            f"to video) inputs and {latents} outputs."
         )
     noisy = tuple(range(latents))
     image = tuple(range(2 * latents, 3 * latents))[: old.in_channels - latents]
@@ -62,7 +62,7 @@ def plan(old: DiTBackbone, latents: int, camera: int) -> Widening:
 
 
 def widen(plan: Widening, params: Params) -> Params:
-    """Return the world model's backbone; leaves that do not change are the same arrays."""
+    """Return the world model's backbone; unchanged leaves are the same arrays."""
     old, new = plan.old, plan.new
     rows = _rows(new, new.in_channels, old.in_channels, plan.inputs)
     columns = _rows(new, new.out_channels, old.out_channels, plan.outputs)
@@ -79,9 +79,9 @@ def widen(plan: Widening, params: Params) -> Params:
 
 
 def narrow(plan: Widening, params: Params) -> Params:
-    """Return the video model within a world model's backbone: the inverse of ``widen``.
+    """Return the video model inside a world model's backbone; the inverse of ``widen``.
 
-    After training, what the network has learnt about depth and camera is lost.
+    After training, what the network has learned about depth and camera is lost.
     """
     old, new = plan.old, plan.new
     rows = _rows(new, new.in_channels, old.in_channels, plan.inputs)
@@ -98,13 +98,13 @@ def narrow(plan: Widening, params: Params) -> Params:
 
 
 def _rows(config: DiTBackbone, wide: int, narrow: int, channels: tuple[int, ...]) -> np.ndarray:
-    """Return, for each value of a narrow patch, its place in the wide one."""
+    """Return, for each value of a narrow patch, its index in the wide one."""
     of_narrow, of_wide = _places(config, narrow), _places(config, wide)
     return np.array([of_wide[cell, channels[channel]] for cell, channel in of_narrow])
 
 
 def _places(config: DiTBackbone, channels: int) -> Mapping[tuple[int, int], int]:
-    """Return (cell of a patch, channel) → place in the row of ``tokens.patchify``."""
+    """Return (cell of a patch, channel) → index in the row of ``tokens.patchify``."""
     p, p_t = config.patch, config.patch_t
     ids = np.arange(p_t * p * p * channels).reshape(1, p_t, p, p, channels)
     order = np.asarray(tokens.patchify(ids, p, p_t))[0, 0]
@@ -112,7 +112,7 @@ def _places(config: DiTBackbone, channels: int) -> Mapping[tuple[int, int], int]
 
 
 def _spread(old: Array, rows: np.ndarray, count: int) -> np.ndarray:
-    """Put rows of an array at their new places; the other rows are zero."""
+    """Scatter rows of an array to their new indices; the other rows are zero."""
     old = np.asarray(old)
     out = np.zeros((count, *old.shape[1:]), old.dtype)
     out[rows] = old

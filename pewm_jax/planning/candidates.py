@@ -1,9 +1,10 @@
-"""Candidates: the frames that their actions lead to, their costs, and their ranking.
+"""Candidates: the frames that follow from their actions, their costs, and their ranking.
 
-A *rollout* is any function ``rollout(actions_KN) -> Frames``, (K, N) frames of K candidates, or the
-last of each, (K, 1). ``ImaginedRollout`` imagines them with a world model; a simulator renders the
-ground truth. ``CandidateCost`` joins a rollout and a cost to the function that ``plan.plan``
-minimizes. ``rank`` sorts the proposals of any policy, such as the 8 or 16 of the paper's Table 2.
+A *rollout* is any function ``rollout(actions_KN) -> Frames`` that returns the (K, N) frames of K
+candidates, or the last frame of each, (K, 1). ``ImaginedRollout`` imagines them with a world model;
+a simulator renders the ground truth. ``CandidateCost`` combines a rollout and a cost into the
+function that ``plan.plan`` minimizes. ``rank`` sorts the proposals of any policy, such as the 8 or
+16 of the paper's Table 2.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _DEPRECATED = {"Imagination": "ImaginedRollout", "Judged": "CandidateCost"}
 
 
 def __getattr__(name: str) -> Any:
-    """Return a class by its former name, with a warning."""
+    """Return a class by its deprecated name, with a warning."""
     if name not in _DEPRECATED:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     now = _DEPRECATED[name]
@@ -40,11 +41,13 @@ def __getattr__(name: str) -> Any:
 
 
 Rollout: TypeAlias = Callable[[Any], Frames]
-"""``rollout(actions_KN) -> Frames``, leading shape (K, N) or, of the last ones, (K, 1)."""
+"""``rollout(actions_KN) -> Frames`` with leading shape (K, N), or (K, 1) for the last frames
+only."""
 
 
 WORKERS = 2
-"""Batches computed at once: operations that XLA runs on one core would leave others idle."""
+"""Number of batches computed concurrently; operations that XLA runs on one core would leave others
+idle."""
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("memory", "last"))
@@ -67,20 +70,20 @@ def _imagined(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ImaginedRollout:
-    """A rollout through a world model, one batch of candidates at a time; memory is not written.
+    """A rollout of a world model, one batch of candidates at a time; the memory is not updated.
 
-    All candidates are imagined from the same noise. Their costs then differ by their actions alone,
-    and the same actions have the same cost in every round.
+    All candidates are imagined from the same noise. Their costs then differ only because of their
+    actions, and the same actions have the same cost in every round.
 
     Attributes:
         config: the model's settings, or an experiment's.
         params: its parameters.
-        state: the world so far.
-        key: the noise.
-        batch: candidates that are imagined together, two batches at a time. It bounds memory use
+        state: the world's state.
+        key: PRNG key of the noise.
+        batch: number of candidates imagined together, two batches at a time. It bounds memory use
             and changes results only by rounding.
-        last: return only the last frame of each; the others are not decoded.
-        memory: False ignores the world's memory.
+        last: return only the last frame of each candidate; the others are not decoded.
+        memory: if False, the world's memory is not used.
     """
 
     config: Config | World
@@ -113,10 +116,10 @@ class ImaginedRollout:
         actions = np.asarray(check_control(actions_KN, "imagine_many"))
         if actions.ndim not in (2, 3) or 0 in actions.shape:
             raise UserError(
-                f"candidates of shape {actions.shape} cannot be imagined: give (K, N) discrete "
+                f"candidates of shape {actions.shape} are not supported: give (K, N) discrete "
                 "actions or (K, N, 3) continuous ones."
             )
-        # Neighbours with equal beginnings come into one batch, where they share their views.
+        # Candidates with equal prefixes are put into one batch, where they share their views.
         order = np.lexsort(actions.reshape(len(actions), -1).T[::-1])
         model, keys = worlds.model_of(self.config), jnp.stack([self.key] * self.batch)
         batches = [order[first : first + self.batch] for first in range(0, len(order), self.batch)]
@@ -131,7 +134,7 @@ class ImaginedRollout:
         with ThreadPoolExecutor(WORKERS) as pool:
             try:
                 for number, part in enumerate(batches):
-                    if number > WORKERS:  # views of few batches are held at once
+                    if number > WORKERS:  # limit the views held at once
                         waiting[number - WORKERS - 1].result()
                     views = self._views and self._views(actions[np.resize(part, self.batch)])
                     waiting.append(pool.submit(imagined, part, views))
@@ -140,13 +143,13 @@ class ImaginedRollout:
                 pool.shutdown(cancel_futures=True)
                 raise
         back = np.argsort(order)
-        # On the host: the number of candidates changes, and would be compiled for anew.
+        # On the host: the number of candidates varies, and would trigger recompilation.
         return jax.tree.map(lambda *x: np.concatenate(x)[back], *parts)
 
 
 @dataclasses.dataclass(eq=False)
 class CandidateCost:
-    """The cost of candidates, as ``plan.plan`` takes it: a rollout and a cost of its frames.
+    """The cost of candidates, for ``plan.plan``: a rollout and a cost of its frames.
 
     The costs of discrete actions are cached: candidates of an earlier round, or of this one, are
     not rolled out again. The rollout must therefore be a function of the actions.
@@ -155,7 +158,7 @@ class CandidateCost:
         rollout: from actions to frames.
         cost: from frames and goal to costs.
         goal: the goal, T = 1.
-        asked: number of candidates requested so far.
+        asked: number of candidates evaluated so far, including cached ones.
         rolled_out: number of these that were rolled out.
     """
 
@@ -186,19 +189,19 @@ class CandidateCost:
         """Return the costs of actions; the last frames are repeated up to ``count`` candidates."""
         self.rolled_out += len(actions)
         frames, missing = self.rollout(actions), count - len(actions)
-        if missing:  # so that a cost is compiled once
+        if missing:  # pad, so that the cost is compiled once
             frames = jax.tree.map(lambda x: np.concatenate([x, [x[-1]] * missing]), frames)
         return np.asarray(self.cost(frames, self.goal), np.float32)[: len(actions)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Ranking:
-    """Proposals in order.
+    """Sorted proposals.
 
     Attributes:
-        order_K: (K,) their numbers, the best first; of equal ones the first given.
-        costs_K: (K,) their costs, in the order given.
-        frames: what was rolled out of each, leading axis K, in the order given.
+        order_K: (K,) indices of the proposals, best first; ties in the given order.
+        costs_K: (K,) their costs, in the given order.
+        frames: the frames rolled out for each, leading axis K, in the given order.
     """
 
     order_K: np.ndarray
@@ -223,16 +226,16 @@ def rank(
     Args:
         config: the model's settings, or an experiment's.
         params: its parameters.
-        state: the world so far.
+        state: the world's state.
         proposals_KN: (K, N) discrete or (K, N, 3) continuous actions of any policy.
         cost: see ``planning.costs``.
         goal: the goal, T = 1.
-        key: the noise, the same for all.
+        key: PRNG key of the noise, the same for all.
         batch: see ``ImaginedRollout``.
-        last: imagine only the last frame of each; False for costs that look at all.
+        last: imagine only the last frame of each; False for costs of all frames.
 
     Raises:
-        UserError: a cost is no number; see ``plan.checked``.
+        UserError: a cost is not a finite number; see ``plan.checked``.
     """
     return rank_by(
         ImaginedRollout(config, params, state, key, batch, last), proposals_KN, cost, goal

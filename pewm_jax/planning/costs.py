@@ -1,14 +1,14 @@
 """Costs: the distance of frames from the goal; lower is better.
 
 A cost is any function ``cost(frames, goal) -> costs_K`` of (K, N) frames and the goal, one frame.
-The costs here compare the last frame, or all of them with ``weights``::
+The costs here compare the last frame, or all frames with ``weights``::
 
     cost = costs.perceptual()                          # LPIPS, as the paper's
     cost = costs.with_depth(costs.Pixels(), weight=0.1)
     cost = costs.Features(config.model, params)        # features of the memory's encoder
     cost = costs.Distance(my_distance)                 # ground truth of the last pose: an oracle
 
-Pictures of NaN cost NaN, which ``plan.plan`` refuses.
+Images with NaN have a NaN cost, for which ``plan.plan`` raises an error.
 """
 
 from __future__ import annotations
@@ -35,16 +35,15 @@ from pewm_jax.types import Array, Frames, Params
 FrameCost: TypeAlias = Callable[[Frames, Frames], Any]
 """``cost(frames, goal) -> costs_K`` of (K, N) frames and a goal of one frame."""
 AT_ONCE = 2**18
-"""Pixels in one batch of a network, or one picture if it has more."""
+"""Pixels in one batch of a network, or one image if it has more."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PictureCost:
-    """A cost of single pictures, taken of the last frame or of all with weights.
+    """A cost of single images, computed for the last frame or for all with weights.
 
     Attributes:
-        weights: how much each of the N frames counts, or None for the last alone; their mean is
-            taken.
+        weights: weight of each of the N frames in the mean, or None for the last frame only.
     """
 
     weights: tuple[float, ...] | None = dataclasses.field(default=None, kw_only=True)
@@ -54,7 +53,7 @@ class PictureCost:
         weights = self.weights
         require(
             weights is None or (min(weights, default=-1) >= 0 and sum(weights) > 0),
-            f"the weights of a cost are {weights}: give one number for each frame, not below 0 and "
+            f"the weights of a cost are {weights}: give one number per frame, not negative and "
             "not all 0.",
         )
 
@@ -62,7 +61,7 @@ class PictureCost:
         """Return (K,) costs.
 
         Raises:
-            UserError: frames and goal differ in size, or there are not as many weights as frames.
+            UserError: frames and goal differ in size, or the numbers of weights and frames differ.
         """
         frames, goal = as_signal(frames), as_signal(goal)
         count = _require_alike(frames, goal)
@@ -84,7 +83,7 @@ class PictureCost:
 
 
 def _require_alike(frames: Frames, goal: Frames) -> int:
-    """Return N, or refuse frames that cannot be compared with the goal."""
+    """Return N; raise an error if frames and goal have different sizes."""
     shape, wanted = frames.rgb_THWC.shape, goal.rgb_THWC.shape
     if len(shape) != 5 or len(wanted) != 4 or wanted[0] != 1 or shape[2:] != wanted[1:]:
         raise UserError(
@@ -118,7 +117,7 @@ class Depth(PictureCost):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Perceptual(PictureCost):
-    """LPIPS to the goal; see ``perceptual``, which reads its weights.
+    """LPIPS distance to the goal; ``perceptual`` loads its weights.
 
     Attributes:
         net: the network.
@@ -167,10 +166,10 @@ def _at_once(rgb_PHWC: Array) -> int:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Features(PictureCost):
-    """Mean squared difference of the features that an image encoder makes.
+    """Mean squared difference of an image encoder's features.
 
     Attributes:
-        settings: an encoder (``models.encoders``), or a model, whose memory's encoder is taken.
+        settings: an encoder (``models.encoders``), or a model, whose memory's encoder is used.
         params: the encoder's parameters, or the world model's.
     """
 
@@ -202,12 +201,12 @@ def _features(
 
 @dataclasses.dataclass(frozen=True)
 class Distance:
-    """The true distance of the last pose from the goal's: an oracle, to measure planners alone.
+    """The true distance of the last pose from the goal: an oracle, to evaluate planners alone.
 
     Attributes:
-        function: from poses (K, 4, 4) and the goal's (4, 4), ``world_from_camera``, to (K,) numbers
-            (inf for what cannot be reached), such as metres along the shortest path, in NumPy or
-            JAX. ``straight`` is one.
+        function: maps poses (K, 4, 4) and the goal's pose (4, 4), ``world_from_camera``, to (K,)
+            distances (inf if unreachable), such as metres along the shortest path, in NumPy or
+            JAX; for example ``straight``.
     """
 
     function: Callable[[Any, Any], Any]
@@ -219,12 +218,12 @@ class Distance:
 
 
 def straight(poses_K44: Any, goal_44: Any, metres_per_radian: float = 0.25) -> Array:
-    """Return the straight distance, metres, and the difference of yaw in its measure.
+    """Return the Euclidean distance plus the weighted difference of yaw, metres.
 
     Args:
         poses_K44: (K, 4, 4) poses.
-        goal_44: (4, 4) the goal's.
-        metres_per_radian: the weight of a radian.
+        goal_44: (4, 4) pose of the goal.
+        metres_per_radian: weight of a radian of yaw.
     """
     poses, goal = jnp.asarray(poses_K44), jnp.asarray(goal_44)
     apart = jnp.linalg.norm(poses[:, :3, 3] - goal[:3, 3], axis=-1)
@@ -237,7 +236,7 @@ class Sum:
     """A weighted sum of costs.
 
     Attributes:
-        parts: ``(weight, cost)`` of each.
+        parts: ``(weight, cost)`` pairs.
     """
 
     parts: tuple[tuple[float, FrameCost], ...]
@@ -251,8 +250,8 @@ def with_depth(cost: FrameCost, weight: float) -> Sum:
     """Return a cost that also compares depth.
 
     Args:
-        cost: that of colours.
-        weight: of the mean difference of the depths' logarithms (``Depth``).
+        cost: the cost of colours.
+        weight: weight of the mean log-depth difference (``Depth``).
     """
     weights = getattr(cost, "weights", None)
     return Sum(((1.0, cost), (weight, Depth(weights=weights))))

@@ -1,4 +1,4 @@
-"""Gymnasium, or a sentence that says how to install it."""
+"""Gymnasium, or an error that says how to install it."""
 
 from __future__ import annotations
 

@@ -1,22 +1,22 @@
-"""``pewm_jax/House-v0``: an agent with an RGB-D camera in a house, which has to get somewhere.
+"""``pewm_jax/House-v0``: an agent with an RGB-D camera in a house that has to reach a goal.
 
-Reward of a step: the metres by which it brought the agent nearer to the goal, on foot (negative
-where it led away), and ``success_reward`` where it reached the goal. The sum over an episode that
-succeeds is the shortest distance at the start, less what was left, plus ``success_reward``.
+The reward of a step is the decrease of the geodesic distance to the goal in metres (negative if it
+increases), plus ``success_reward`` if the step reaches the goal. The return of a successful episode
+is the geodesic distance at the start, minus the remaining distance, plus ``success_reward``.
 
-An episode ends where the goal is reached (``terminated``): nearer than ``success_m`` on foot and
-``success_deg`` in heading; it is cut off after ``max_steps`` (``truncated``).
+An episode ends when the goal is reached (``terminated``): closer than ``success_m`` in geodesic
+distance and ``success_deg`` in heading. It is truncated after ``max_steps`` (``truncated``).
 
-``info`` holds
+``info`` contains
 
-    geodesic_distance  metres to the goal on foot
-    position_error     metres to the goal, straight
+    geodesic_distance  geodesic distance to the goal, metres
+    position_error     Euclidean distance to the goal, metres
     yaw_error          radians between the heading and the goal's, from 0 to π
     success            whether the goal is reached
-    collision          whether the last move was not free; the agent never leaves the free area
-    steps              steps made
-    path_length        metres walked
-    shortest_path      metres from start to goal on foot
+    collision          whether the last move was blocked; the agent never leaves the free area
+    steps              number of steps
+    path_length        length of the path, metres
+    shortest_path      geodesic distance from start to goal, metres
     spl                success weighted by path length (Anderson et al., arXiv:1807.06757)
     goal_pose          (4, 4) the camera at the goal
     scene              name of the scene
@@ -50,8 +50,8 @@ class Task:
 
     Attributes:
         start_3: (3,) x, y, yaw of the first frame.
-        goal_3: (3,) x, y, yaw of the goal; its heading is that of an agent that arrives by
-            the shortest path.
+        goal_3: (3,) x, y, yaw of the goal; its heading is that of an agent arriving by the
+            shortest path.
         ways: the shortest paths to the goal.
         shortest_m: length of the shortest path from the start.
     """
@@ -63,19 +63,19 @@ class Task:
 
 
 def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, where: str) -> Task:
-    """Draw a start and a goal whose distance on foot lies within the configured bounds.
+    """Sample a start and a goal whose geodesic distance is within the configured bounds.
 
-    The goal is uniform over the free area, the start over that part of it which is in bounds, the
-    start's heading over the circle.
+    The goal is uniform over the free area, the start is uniform over the part of it within bounds,
+    and the start's heading is uniform.
 
     Args:
-        config: ``min_distance_m`` and ``max_distance_m`` count.
+        config: ``min_distance_m`` and ``max_distance_m`` are used.
         grid: where the agent can stand.
         rng: random numbers.
-        where: name of the scene, for the refusal.
+        where: name of the scene, for error messages.
 
     Raises:
-        UserError: no such pair was found.
+        UserError: no such pair exists.
     """
     low, high = config.min_distance_m, config.max_distance_m
     farthest = 0.0
@@ -83,7 +83,7 @@ def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, wher
         ways = PathsToGoal(grid, goal)
         distance = np.where(np.isfinite(ways.distance_YX), ways.distance_YX, -1.0)
         farthest = max(farthest, float(distance.max()))
-        # Distances from cell to cell are up to 8 % longer than the shortened path.
+        # Grid distances are up to 8 % longer than the smoothed path.
         cells = np.argwhere((distance >= low) & (distance <= 1.1 * high + grid.cell_m))
         for _ in range(STARTS_TRIED if len(cells) else 0):
             start = grid.centre_of(cells[rng.integers(len(cells))])
@@ -96,16 +96,16 @@ def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, wher
                 yaw = rng.uniform(-math.pi, math.pi)
                 return Task(np.array([*start, yaw]), np.array([*goal, heading]), ways, length)
     raise UserError(
-        f"{where} has no two places from {low:g} to {high:g} m apart on foot (the farthest found "
-        f"are {farthest:.1f} m): change min_distance_m and max_distance_m, or take a scene with "
-        "more room."
+        f"{where} has no two places with a geodesic distance from {low:g} to {high:g} m (the "
+        f"farthest found are {farthest:.1f} m apart): change min_distance_m and max_distance_m, or "
+        "use a larger scene."
     )
 
 
 class HouseEnv(gymnasium.Env):
-    """A house to walk in. ``gymnasium.make("pewm_jax/House-v0", **settings)`` makes one.
+    """A house environment, created by ``gymnasium.make("pewm_jax/House-v0", **settings)``.
 
-    The same seed gives the same episode, bit for bit. Spaces: see ``planning.observations``.
+    The same seed gives bit-identical episodes. Spaces: see ``planning.observations``.
 
     Attributes:
         config: the settings.
@@ -115,24 +115,24 @@ class HouseEnv(gymnasium.Env):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
 
     def __init__(
-        self, config: HouseConfig | None = None, render_mode: str | None = None, **given: Any
+        self, config: HouseConfig | None = None, render_mode: str | None = None, **overrides: Any
     ):
         """Open the house.
 
         Args:
-            config: the settings; or give them by name.
+            config: the settings; or pass them as keyword arguments.
             render_mode: None or "rgb_array".
-            given: settings of ``HouseConfig``.
+            overrides: settings of ``HouseConfig``.
 
         Raises:
-            UserError: settings that cannot work, a mesh that does not load or has no place to
-                stand, or no renderer.
+            UserError: invalid settings, a mesh that does not load or has no free floor, or no
+                renderer.
         """
         if render_mode not in (None, "rgb_array"):
-            raise UserError(f"House has no render_mode {render_mode!r}; there is 'rgb_array'.")
-        if config is not None and given:
-            raise UserError("House got a HouseConfig and other settings; give one of the two.")
-        self.config = settings(given) if config is None else config
+            raise UserError(f"House has no render_mode {render_mode!r}; use 'rgb_array'.")
+        if config is not None and overrides:
+            raise UserError("House got a HouseConfig and other settings; pass only one of the two.")
+        self.config = settings(overrides) if config is None else config
         self.render_mode = render_mode
         self.observation_space = observations.observation_space(self.config)
         self.action_space = observations.action_space(self.config)
@@ -144,18 +144,18 @@ class HouseEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode.
+        """Start an episode.
 
         Args:
-            seed: fixes everything random from here on.
-            options: none are known.
+            seed: seed of all randomness from here on.
+            options: must be empty.
 
         Raises:
-            UserError: the scene has no room for the task.
+            UserError: the scene is too small for the task.
         """
         super().reset(seed=seed)
         if options:
-            raise UserError(f"House.reset() knows no options, got {', '.join(options)}.")
+            raise UserError(f"House.reset() takes no options, got {', '.join(options)}.")
         config = self.config
         if not config.scene and config.houses > 1:
             number = int(self.np_random.integers(config.houses))
@@ -170,10 +170,10 @@ class HouseEnv(gymnasium.Env):
         return self._observation(), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Carry out an action; see the module for reward, end and ``info``.
+        """Apply an action; see the module docstring for reward, termination and ``info``.
 
         Raises:
-            UserError: an action that is not of the space, or there is no episode.
+            UserError: the action is not in the space, or there is no episode.
         """
         task = self._task
         if task is None or self._over:
@@ -196,7 +196,7 @@ class HouseEnv(gymnasium.Env):
         return self._observation(), reward, success, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """Return what is seen, (H, W, 3) uint8, with render mode "rgb_array".
+        """Return the current image, (H, W, 3) uint8, with render mode "rgb_array".
 
         Raises:
             UserError: before the first ``reset``.
@@ -207,9 +207,9 @@ class HouseEnv(gymnasium.Env):
         return self._seen.rgb_THWC[0].copy()
 
     def look_around(self) -> Frames:
-        """Return what the agent sees while it turns once around where it stands; nothing changes.
+        """Return the frames of one full turn in place; the state does not change.
 
-        The last frame is the present one, so that a world started with them begins here.
+        The last frame is the present one, so a world can be started from these frames.
 
         Raises:
             UserError: before the first ``reset``.
@@ -220,7 +220,7 @@ class HouseEnv(gymnasium.Env):
         return self._simulator.frames(planar)
 
     def goal_frame(self) -> Frames:
-        """Return the one frame that is seen at the goal.
+        """Return the frame at the goal.
 
         Raises:
             UserError: before the first ``reset``.
@@ -230,7 +230,7 @@ class HouseEnv(gymnasium.Env):
 
     @property
     def grid(self) -> NavGrid:
-        """Return where the agent can stand; the cell of its centre is always free."""
+        """Return the navigation grid; the cell of the agent's centre is always free."""
         return self._simulator.grid
 
     @property
@@ -246,7 +246,7 @@ class HouseEnv(gymnasium.Env):
 
     @property
     def planar(self) -> np.ndarray:
-        """Return a copy of where the agent is: x, y, yaw in (−π, π], float64.
+        """Return a copy of the agent's pose: x, y, yaw in (−π, π], float64.
 
         Raises:
             UserError: before the first ``reset``.

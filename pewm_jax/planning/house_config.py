@@ -14,17 +14,17 @@ from pewm_jax.errors import require
 
 @dataclasses.dataclass(frozen=True)
 class HouseConfig:
-    """Where an agent walks, what it sees, how it moves, and where it has to go."""
+    """Settings of a house: scene, camera, actions and goals."""
 
     scene: str | Path = ""
     """A mesh to walk in (GLB, OBJ, PLY, …), in metres; empty: a generated house."""
     up: Literal["auto", "y", "z"] = "auto"
     """Which axis of the mesh points up; `auto`: y for GLB and glTF, z for the others."""
     house: int = 0
-    """Seed of the generated house. `pewm-jax data collect` trains on 0, 3, 6, …, watches training
-    on 1, 4, 7, … and tests on 2, 5, 8, …"""
+    """Seed of the generated house. `pewm-jax data collect` uses 0, 3, 6, … for training, 1, 4, 7, …
+    for validation and 2, 5, 8, … for tests."""
     houses: int = 1
-    """Number of houses for episodes: `house`, `house` + 3, …, all of one split."""
+    """Number of houses for episodes: `house`, `house` + 3, …, all from one split."""
     height: int = 64
     """Height of the images, pixels."""
     width: int = 64
@@ -43,16 +43,16 @@ class HouseConfig:
     sliding: bool = False
     """Slide along obstacles instead of stopping."""
     task: Literal["point", "image"] = "point"
-    """What is known of the goal. `point`: where it is, seen from the agent. `image`: what is seen
-    there."""
+    """Specification of the goal. `point`: its position relative to the agent. `image`: the image at
+    the goal."""
     min_distance_m: float = 1.0
-    """The goal is at least so far from the start, on foot, metres."""
+    """Smallest geodesic distance from start to goal, metres."""
     max_distance_m: float = 30.0
-    """The goal is at most so far from the start, on foot, metres."""
+    """Largest geodesic distance from start to goal, metres."""
     success_m: float = 0.5
-    """The goal is reached this near to it, on foot, metres."""
+    """Geodesic distance at which the goal counts as reached, metres."""
     success_deg: float = 180.0
-    """… and with a heading this near to the goal's, degrees; 180: any."""
+    """Largest difference from the goal's heading for success, degrees; 180: any."""
     success_reward: float = 2.5
     """Reward for reaching the goal, in addition to 1 per metre of approach."""
     max_steps: int = 200
@@ -64,11 +64,11 @@ class HouseConfig:
             value = getattr(self, name)
             require(
                 isinstance(value, int) and value >= 1,
-                f"House.{name} is {value!r}: use a whole number from 1 on.",
+                f"House.{name} is {value!r}: use an integer of 1 or more.",
             )
         require(
             isinstance(self.house, int) and self.house >= 0,
-            f"House.house is {self.house!r}: use a whole number from 0 on.",
+            f"House.house is {self.house!r}: use an integer of 0 or more.",
         )
         choices = {
             "up": ("auto", "y", "z"),
@@ -108,20 +108,20 @@ class HouseConfig:
 
     @property
     def action_config(self) -> ActionConfig:
-        """What one action does."""
+        """Return the motion of one action."""
         return ActionConfig(self.step_m, self.turn_deg)
 
 
-def settings(given: dict[str, Any]) -> HouseConfig:
+def settings(values: dict[str, Any]) -> HouseConfig:
     """Return settings from keyword arguments.
 
     Raises:
-        ConfigError: a setting that does not exist, or has a value that cannot work.
+        ConfigError: a setting does not exist or has an invalid value.
     """
     known = [field.name for field in dataclasses.fields(HouseConfig)]
-    for name in given:
+    for name in values:
         if name not in known:
             near = difflib.get_close_matches(name, known, 1, 0.5)
             meant = f" (did you mean {near[0]}?)" if near else ""
-            raise ConfigError(f"House has no setting {name!r}{meant}; there is {', '.join(known)}.")
-    return HouseConfig(**given)
+            raise ConfigError(f"House has no setting {name!r}{meant}; known: {', '.join(known)}.")
+    return HouseConfig(**values)

@@ -1,19 +1,19 @@
 """Any world as a pure functional environment.
 
-Its two functions work eagerly, and under jit, vmap and scan with the model static::
+Its two functions work eagerly, and under jit, vmap and scan with a static model::
 
     state = reset(model, params, frames, key)               # posed RGB-D frames
     state, seen = step(model, params, state, action, key)   # one action
     state, seen = step(model, params, state, actions, key)  # a block of n actions
 
-What a step is: a world imagines clips of ``clip.frames − 1`` frames. One action is imagined as a
-clip of its own, in which the agent stands still after the action; its first frame is what is seen
-and remembered, the others are dropped. So a single step costs as much as a block that fills a clip.
-A block of any length is imagined clip by clip, as ``worlds.imagine`` does; the frames of a clip are
-drawn together, and so are not those of single steps. Prefer blocks where a policy can commit to
+A world imagines clips of ``clip.frames − 1`` frames. A single action is imagined as its own clip,
+in which the agent stands still after the action; the first frame is returned and inserted into the
+memory, the others are discarded. So a single step costs as much as a block that fills a clip. A
+block of any length is imagined clip by clip, as in ``worlds.imagine``; the frames of one clip are
+sampled jointly, those of separate single steps are not. Prefer blocks if a policy can commit to
 them.
 
-Walls are not known here: a move goes where it leads, and what is seen there is imagined.
+There is no collision detection: a move is always executed, and the frame at its end is imagined.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class ImaginedState:
     """The state of the environment, a pytree.
 
     Attributes:
-        world: the world: its present frame and its memory.
+        world: the world's state: its present frame and its memory.
         steps: () int32, actions since ``reset``.
     """
 
@@ -61,17 +61,17 @@ def reset(
     *,
     depth_scale: float | None = None,
 ) -> ImaginedState:
-    """Begin with what has been seen.
+    """Start from observed frames.
 
     Args:
         model: the model's settings, or an experiment's; static under jit.
         params: the world model's parameters.
         frames: S ≥ 1 posed RGB-D frames; the last one is the present.
-        key: for worlds that begin at random; none of the library's does.
+        key: for worlds with a random start; the library has none.
         depth_scale: as for ``worlds.start``.
 
     Raises:
-        UserError: the frames do not fit the model, or cannot be used; see ``worlds.start``.
+        UserError: the frames do not fit the model, or are invalid; see ``worlds.start``.
     """
     del key
     world = worlds.start(model, params, frames, depth_scale=depth_scale)
@@ -85,7 +85,7 @@ def step(
     action: Any,
     key: Array,
 ) -> tuple[ImaginedState, dict[str, Array]]:
-    """Imagine what is seen after one action, or after each of a block; see the module.
+    """Imagine the frame after one action, or after each action of a block; see the module.
 
     Args:
         model: as for ``reset``.
@@ -116,8 +116,8 @@ def step(
 
 
 def observation(state: ImaginedState) -> dict[str, Array]:
-    """Return what is seen at present: after ``reset`` the last frame that was given."""
-    return _shown(state.world.frame, single=True)
+    """Return the present observation: after ``reset`` the last frame passed to it."""
+    return _to_observations(state.world.frame, single=True)
 
 
 def distance(pose: Array, goal: Array) -> Array:
@@ -132,37 +132,37 @@ def turned(pose: Array, goal: Array) -> Array:
 
 
 def reached(pose: Array, goal: Array, within_m: float = 0.5, within_deg: float = 180.0) -> Array:
-    """Return (…) bool: whether cameras (…, 4, 4) are at a goal (4, 4), inclusive of the bounds."""
+    """Return (…) bool: whether cameras (…, 4, 4) are at a goal (4, 4), bounds included."""
     near = distance(pose, goal) <= within_m
     return near & (jnp.degrees(turned(pose, goal)) <= within_deg)
 
 
 def satisfied(seen: dict[str, Array], cost: Callable[[Array], Array], at_most: float) -> Array:
-    """Return whether a cost of the image seen is at most a bound: a goal without a pose.
+    """Return whether a cost of the observed image is at most a bound: a goal without a pose.
 
     Args:
         seen: the observation of a single step.
         cost: an image (H, W, 3) uint8 → a number, such as the distance to a goal image.
-        at_most: the bound, inclusive.
+        at_most: the bound, included.
     """
     return jnp.asarray(cost(seen["rgb"]) <= at_most)
 
 
 def _is_single(action: Array) -> bool:
-    """Tell one action from a block of them."""
+    """Return whether this is a single action instead of a block."""
     whole = jnp.issubdtype(action.dtype, jnp.integer)
     return action.ndim == 0 or (action.ndim == 1 and not whole)
 
 
 @functools.partial(jax.jit, static_argnames="single", inline=True)
 def _after(steps: Array, frames: Frames, *, single: bool) -> tuple[Array, dict[str, Array]]:
-    """Return the number of steps after more frames, and the frames as observations."""
-    return steps + frames.depth_THW.shape[0], _shown(frames, single=single)
+    """Return the updated number of steps, and the frames as observations."""
+    return steps + frames.depth_THW.shape[0], _to_observations(frames, single=single)
 
 
 @functools.partial(jax.jit, static_argnames="single", inline=True)
-def _shown(frames: Frames, *, single: bool) -> dict[str, Array]:
-    """Return frames (T, …) as observations; of a ``single`` one without the axis T."""
+def _to_observations(frames: Frames, *, single: bool) -> dict[str, Array]:
+    """Return frames (T, …) as observations; without the axis T if ``single``."""
     seen = {
         "rgb": rgb_from_signal(frames.rgb_THWC),
         "depth": jnp.asarray(frames.depth_THW, jnp.float32),

@@ -1,16 +1,16 @@
 """A world as a Gymnasium environment with the spaces of ``pewm_jax/House-v0``.
 
-A policy that was written for the house runs in it unchanged: what it sees is imagined. An episode
-begins with frames that were really seen, in the house of the settings or given by the caller.
+A policy for the house runs in it unchanged: its observations are imagined. An episode starts from
+real frames, of the configured house or passed by the caller.
 
-Reward and goal differ from the house's, as walls are not known in imagination: the reward of a
-step is the metres by which it brought the agent nearer to the goal in a straight line, and
-``success_reward`` where it reached the goal. With a cost of one's own, the reward is the decrease
-of that cost, and the goal is reached where it is at most ``cost_at_most``.
+Reward and goal differ from the house's, because imagination has no collision detection: the reward
+of a step is the decrease of the Euclidean distance to the goal in metres, plus ``success_reward``
+if it reaches the goal. With a custom cost, the reward is the decrease of that cost, and the goal is
+reached when it is at most ``cost_at_most``.
 
-``info`` holds ``position_error``, ``yaw_error``, ``success``, ``steps``, ``path_length`` and
-``goal_pose`` as the house does, and ``cost`` where one is given. There are no collisions, and a
-goal on the other side of a wall may count as reached.
+``info`` contains ``position_error``, ``yaw_error``, ``success``, ``steps``, ``path_length`` and
+``goal_pose`` as in the house, and ``cost`` if one is given. There are no collisions, and a goal on
+the other side of a wall may count as reached.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from pewm_jax.types import Frames, Params
 
 
 class WorldModelEnv(gymnasium.Env):
-    """A world to walk in, imagined; spaces and settings are the house's.
+    """An imagined world as an environment; spaces and settings are the house's.
 
     Attributes:
         config: the settings, with the image size and the actions of the model.
-        intrinsics_4: (4,) of the camera that has seen the first frames.
+        intrinsics_4: (4,) intrinsics of the camera of the first frames.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
@@ -53,29 +53,29 @@ class WorldModelEnv(gymnasium.Env):
         cost_at_most: float = 0.0,
         render_mode: str | None = None,
     ):
-        """Take a trained world, as ``pewm_jax.load`` returns it.
+        """Wrap a trained world, as returned by ``pewm_jax.load``.
 
         Args:
             model: the experiment; or the model's settings.
             params: its parameters.
-            house: where episodes begin and what they ask for. Image size, step and turn are
-                replaced by the model's. The house opens at the first ``reset`` that needs it.
-            cost: the goal as a number: image (H, W, 3) uint8 → cost. By default the goal is a
-                pose.
-            cost_at_most: the goal is reached where the cost is at most this.
+            house: start and goal of episodes. Image size, step and turn are replaced by the
+                model's. The house is opened at the first ``reset`` that needs it.
+            cost: a cost that defines the goal: image (H, W, 3) uint8 → cost. By default the goal is
+                a pose.
+            cost_at_most: the goal is reached when the cost is at most this.
             render_mode: None or "rgb_array".
 
         Raises:
-            UserError: the render mode is not known, or the world has no actions.
+            UserError: the render mode is unknown, or the world has no actions.
         """
         if render_mode not in (None, "rgb_array"):
-            raise UserError(f"the world has no render_mode {render_mode!r}; there is 'rgb_array'.")
+            raise UserError(f"the world has no render_mode {render_mode!r}; use 'rgb_array'.")
         self._model, self._params = model, params
         world = worlds.model_of(model)
         if not (isinstance(world, World) and world.capabilities.actions):
             raise UserError(
-                f"a {type(world).__name__} is no world to walk in: it has no actions; give one "
-                "that imagines, such as pewm_jax.load('small')."
+                f"a {type(world).__name__} has no actions, so it cannot be an environment: use a "
+                "world with actions, such as pewm_jax.load('small')."
             )
         clip, actions = world.clip, world.actions
         self.config = dataclasses.replace(
@@ -97,17 +97,17 @@ class WorldModelEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Begin an episode with what was really seen.
+        """Start an episode from real frames.
 
         Args:
-            seed: fixes everything random from here on, the sampling noise too; the house's episode
-                is the one that it begins with this seed.
+            seed: seed of all randomness from here on, including the sampling noise; it also
+                determines the house's episode.
             options: ``frames``: S ≥ 1 posed frames (an episode's, or ``frames_of`` of a house's
-                observations), with ``goal``: the one frame at the goal. Without options an episode
-                of the house begins, where the agent first looks around.
+                observations), and ``goal``: the frame at the goal. Without options an episode of
+                the house starts, in which the agent first makes a full turn.
 
         Raises:
-            UserError: the frames do not fit the model or cannot be used, or there is no goal.
+            UserError: the frames do not fit the model or are invalid, or there is no goal.
         """
         super().reset(seed=seed)
         self._house_seed = self._house_seed if seed is None else seed
@@ -122,10 +122,10 @@ class WorldModelEnv(gymnasium.Env):
         return self._observation(), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Imagine what is seen after an action; see the module for reward, end and ``info``.
+        """Imagine the frame after an action; see the module for reward, termination and ``info``.
 
         Raises:
-            UserError: an action that is not of the space, or there is no episode.
+            UserError: the action is not in the space, or there is no episode.
         """
         if self._state is None or self._over:
             raise UserError("step() was called outside of an episode: call reset() first.")
@@ -145,7 +145,7 @@ class WorldModelEnv(gymnasium.Env):
         return self._observation(), reward, success, truncated, info
 
     def render(self) -> np.ndarray | None:
-        """Return what is seen, (H, W, 3) uint8, with render mode "rgb_array".
+        """Return the current image, (H, W, 3) uint8, with render mode "rgb_array".
 
         Raises:
             UserError: before the first ``reset``.
@@ -157,12 +157,12 @@ class WorldModelEnv(gymnasium.Env):
         return self._seen["rgb"].copy()
 
     def _begin(self, options: dict[str, Any]) -> tuple[Frames, Frames]:
-        """Return the frames to begin with, and the one at the goal."""
+        """Return the first frames, and the frame at the goal."""
         unknown = options.keys() - {"frames", "goal"}
         if unknown or (options and len(options) < 2):
             raise UserError(
-                f"the world's reset() got the options {', '.join(sorted(options))}: give frames "
-                "(posed RGB-D frames) and goal (the one frame at the goal), or no options to begin "
+                f"the world's reset() got the options {', '.join(sorted(options))}: pass frames "
+                "(posed RGB-D frames) and goal (the frame at the goal), or no options to start "
                 "in the house."
             )
         if options:
@@ -174,7 +174,7 @@ class WorldModelEnv(gymnasium.Env):
         return self._house.look_around(), self._house.goal_frame()
 
     def _look(self, seen: dict[str, Any]) -> None:
-        """Take over what is seen, within the space."""
+        """Store an observation, clipped to the space."""
         found = {name: np.array(value) for name, value in seen.items()}
         found["depth"] = np.clip(np.nan_to_num(found["depth"], posinf=0.0), 0, DEPTH_LIMIT_M)
         self._seen = found
@@ -184,7 +184,7 @@ class WorldModelEnv(gymnasium.Env):
         return np.array(self._goal.camera.world_from_camera[-1], np.float32)
 
     def _measure(self) -> float:
-        """Return what has to become small: the cost, or the distance to the goal."""
+        """Return the quantity to minimize: the cost, or the distance to the goal."""
         if self._cost is not None:
             return float(self._cost(self._seen["rgb"]))
         return scores.position_error(self._seen["pose"], self._goal_pose)

@@ -1,9 +1,9 @@
-"""Model predictive control: plan, carry out the first actions, observe, and plan again.
+"""Model predictive control: plan, execute the first actions, observe, and plan again.
 
-A ``Predictor`` rolls candidates out: a world model, which observes every real frame
-(``world_predictor``), or a simulator that has the ground truth (``simulator_predictor``). The
-agent acts through a function ``step(action) -> (frames, done)`` that returns the one real frame
-after an action, and whether the goal is reached.
+A ``Predictor`` rolls candidates out: a world model that observes every real frame
+(``world_predictor``), or a simulator with the ground truth (``simulator_predictor``). The agent
+acts through a function ``step(action) -> (frames, done)`` that returns the real frame after an
+action, and whether the goal is reached.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _DEPRECATED = {
 
 
 def __getattr__(name: str) -> Any:
-    """Return a class or function by its former name, with a warning."""
+    """Return a class or function by its deprecated name, with a warning."""
     if name not in _DEPRECATED:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     now = _DEPRECATED[name]
@@ -52,12 +52,12 @@ Step: TypeAlias = Callable[[Any], tuple[Frames, bool]]
 
 @dataclasses.dataclass(frozen=True)
 class Predictor:
-    """What predicts the frames of candidates.
+    """Predicts the frames of candidates.
 
     Attributes:
-        start: from the first real frames to a state of any kind.
-        observe: from a state and more real frames to the state after them.
-        rollout: from a state and a key to a rollout of candidates.
+        start: maps the first real frames to a state of any type.
+        observe: maps a state and more real frames to the next state.
+        rollout: maps a state and a key to a rollout of candidates.
     """
 
     start: Callable[[Frames], Any]
@@ -73,14 +73,14 @@ def world_predictor(
     last: bool = True,
     memory: bool = True,
 ) -> Predictor:
-    """Return a predictor that imagines with a world model and remembers the real frames.
+    """Return a predictor that imagines with a world model and observes the real frames.
 
     Args:
         config: the model's settings, or an experiment's.
         params: its parameters.
         batch: see ``ImaginedRollout``.
-        last: imagine only the last frame of each candidate; False for costs that look at all.
-        memory: False ignores the world's memory.
+        last: imagine only the last frame of each candidate; False for costs of all frames.
+        memory: if False, the world's memory is not used.
     """
     model = worlds.model_of(config)
 
@@ -98,7 +98,7 @@ def simulator_predictor(rollout_from: Callable[[Frames], Rollout]) -> Predictor:
     """Return a predictor that renders the frames of candidates with a simulator.
 
     Args:
-        rollout_from: from the present frame, T = 1, to a rollout.
+        rollout_from: maps the present frame, T = 1, to a rollout.
     """
 
     def last(frames: Frames) -> Frames:
@@ -109,15 +109,15 @@ def simulator_predictor(rollout_from: Callable[[Frames], Rollout]) -> Predictor:
 
 @dataclasses.dataclass(frozen=True)
 class Trajectory:
-    """What an agent did.
+    """The trajectory of an agent.
 
     Attributes:
-        actions: (n,) discrete or (n, A) continuous actions that it carried out.
-        frames: (n,) what it saw after each.
-        plans: every plan that it made.
-        costs: (p,) the cost of each plan, as it was foreseen.
+        actions: (n,) discrete or (n, A) continuous actions executed.
+        frames: (n,) observed frames, one after each action.
+        plans: all plans.
+        costs: (p,) predicted cost of each plan.
         reached: whether the goal was reached.
-        state: the predictor's state at the end.
+        state: the predictor's final state.
     """
 
     actions: np.ndarray
@@ -145,36 +145,36 @@ def mpc(
 ) -> Trajectory:
     """Act until the goal is reached or the budget is spent.
 
-    Each plan but the first starts from the rest of the one before. The same key in the same
-    surroundings gives the same trajectory.
+    Each plan but the first starts from the rest of the previous one. The same key in the same
+    environment gives the same trajectory.
 
     Args:
         predictor: see ``world_predictor`` and ``simulator_predictor``.
-        step: the surroundings.
+        step: the environment.
         observed: (S,) real frames; the last one is the present.
         goal: the goal, T = 1.
         cost: see ``planning.costs``.
         planner: see ``planning.settings``.
-        config: the size of a plan, and how much of it is carried out.
+        config: the size of a plan, and how much of it is executed.
         key: randomness; plan i uses ``fold_in(key, i)``.
-        budget: actions at most.
+        budget: largest number of actions.
         folder: where plans are stored during the search and afterwards. The same call resumes: it
-            reads the finished plans, carries them out again, and continues the interrupted one. The
+            reads the finished plans, executes them again, and continues the interrupted one. The
             frames must be the same.
         about: with ``folder``: what plans depend on besides settings, key and frames, such as
-            hashes of the cost and of the model's weights. Plans with other inputs are refused.
-        progress: show it.
+            hashes of the cost and of the model's weights. Plans with other inputs are an error.
+        progress: whether to show progress.
 
     Raises:
-        UserError: the budget allows no action, there is a folder and not what its plans are about,
-            or a plan is refused; see ``plan.plan``.
+        UserError: the budget allows no action, ``folder`` is set without ``about``, or a plan
+            fails; see ``plan.plan``.
     """
     if budget < 1:
         raise UserError(f"budget is {budget}: allow at least one action.")
     if folder is not None and not about:
         raise UserError(
-            "plans are stored in a folder: give about=…, what they depend on, such as the names of "
-            "the model and of the cost, so that plans of another are not taken for them."
+            "plans are stored in a folder: pass about=…, what they depend on, such as the names of "
+            "the model and of the cost, so that plans with other inputs are not reused."
         )
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -220,7 +220,7 @@ def _joined(frames: list[Frames]) -> Frames:
 
 
 def _hash(*frames: Frames) -> str:
-    """Return a hash of frames, by which a stored plan is recognised."""
+    """Return a hash of frames, which identifies a stored plan."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(frames):
         digest.update(np.ascontiguousarray(leaf).tobytes())

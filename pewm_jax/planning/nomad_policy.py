@@ -1,11 +1,11 @@
-"""Proposals by NoMaD: trajectories from the pictures seen and, optionally, one of the goal.
+"""Proposals of NoMaD: trajectories from observed images and, optionally, a goal image.
 
     waypoints = nomad_policy.propose(policy, params, seen, goal, key, 16)   # (16, 8, 2) metres
     actions = nomad_policy.continuous(waypoints)                            # (16, 8, 3)
     steps = nomad_policy.discrete(model.actions, waypoints)                 # (16, 8)
 
-``worlds.imagine_many`` and ``candidates.rank`` take either kind of actions. ``Policy`` acts on its
-own.
+``worlds.imagine_many`` and ``candidates.rank`` accept either kind of actions. ``Policy`` acts
+without a planner.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from pewm_jax.types import Array, Params
 STILL_M = 0.02
 """A step shorter than this has no direction, metres."""
 SEQUENCES_AT_ONCE = 6561
-"""Sequences of discrete actions that are compared at once: all sequences of 8 actions."""
+"""Number of sequences of discrete actions compared at once: all sequences of 8 actions."""
 
 
 def history(config: NomadConfig, rgb_SHWC: np.ndarray) -> np.ndarray:
-    """Return the last context + 1 of S ≥ 1 pictures; where there are fewer, the first repeated."""
+    """Return the last context + 1 of S ≥ 1 images; if there are fewer, repeat the first."""
     count = config.context + 1
     seen = np.asarray(rgb_SHWC)[-count:]
     return np.concatenate([np.repeat(seen[:1], count - len(seen), 0), seen])
@@ -50,23 +50,23 @@ def propose(
 ) -> Array:
     """Sample trajectories.
 
-    Pure, and compiled once for each configuration, count and set of shapes; under a jit of the
-    caller's, config and count are static.
+    Pure, and compiled once per configuration, count and set of shapes; inside the caller's jit,
+    config and count are static.
 
     Args:
         config: the policy.
         params: its parameters.
-        rgb_THWC: (context + 1, H, W, 3) pictures seen, uint8 or floats in [−1, 1], the present
+        rgb_THWC: (context + 1, H, W, 3) observed images, uint8 or floats in [−1, 1], the present
             last (``history``).
-        goal_HWC: (H, W, 3) what is seen at the goal; None to explore.
+        goal_HWC: (H, W, 3) image at the goal; None to explore.
         key: randomness.
         count: K proposals.
 
     Returns:
-        (K, N, 2) waypoints: metres forward and metres left of the present place.
+        (K, N, 2) waypoints: metres forward and metres left of the present position.
 
     Raises:
-        UserError: another number of pictures.
+        UserError: the number of images is wrong.
     """
     return _propose(config, params, rgb_THWC, goal_HWC, key, count)
 
@@ -98,21 +98,21 @@ def _propose(
 
 @functools.partial(jax.jit, static_argnums=0, inline=True)
 def distance(config: NomadConfig, params: Params, rgb_THWC: Array, goal_HWC: Array) -> Array:
-    """Return how many steps the policy believes the goal to be away, (); see ``propose``."""
+    """Return the policy's estimate of the number of steps to the goal, (); see ``propose``."""
     seen = nomad.preprocess(config, signal_from_rgb(rgb_THWC))[None]
     shown = nomad.preprocess(config, signal_from_rgb(goal_HWC)[None])
     return nomad.distance(config, params, nomad.encode(config, params, seen, shown, [False]))[0]
 
 
 def continuous(waypoints_KN2: np.ndarray) -> np.ndarray:
-    """Return the actions that lead through waypoints, one to each.
+    """Return the actions that pass through waypoints, one per waypoint.
 
-    The agent moves straight to a waypoint and then turns to where the next one is; after the last
-    it looks where it came from, as it does where waypoints do not differ. So the first move may
-    be sideways, and each is as long as the distance to its waypoint.
+    The agent moves straight to a waypoint and then turns towards the next one; after the last
+    one, or between equal waypoints, it keeps its heading. So the first move may be sideways, and
+    each is as long as the distance to its waypoint.
 
     Args:
-        waypoints_KN2: (..., N, 2) metres forward and left of the present place.
+        waypoints_KN2: (..., N, 2) metres forward and left of the present position.
 
     Returns:
         (..., N, 3) float32: dx, dy, dyaw.
@@ -134,15 +134,15 @@ def continuous(waypoints_KN2: np.ndarray) -> np.ndarray:
 
 
 def discrete(actions: ActionConfig, waypoints_KN2: np.ndarray) -> np.ndarray:
-    """Return the discrete actions that come nearest to waypoints, one for each.
+    """Return the discrete actions that best approximate waypoints, one per waypoint.
 
-    The squared distances between the place after action k and waypoint k are least in sum: of all
-    sequences for up to 8 waypoints, and else of the best ``SEQUENCES_AT_ONCE`` beginnings. Of
-    equally good ones the one that goes forward first, then left, is taken.
+    They minimize the sum of squared distances between the position after action k and waypoint k:
+    over all sequences for up to 8 waypoints, otherwise by a beam search with
+    ``SEQUENCES_AT_ONCE`` prefixes. Ties prefer forward first, then left.
 
     Args:
-        actions: what an action does.
-        waypoints_KN2: (..., N, 2) metres forward and left of the present place.
+        actions: the motion of an action.
+        waypoints_KN2: (..., N, 2) metres forward and left of the present position.
 
     Returns:
         (..., N) integers.
@@ -155,7 +155,7 @@ def discrete(actions: ActionConfig, waypoints_KN2: np.ndarray) -> np.ndarray:
 
 
 def _nearest(table: np.ndarray, points_N2: np.ndarray) -> np.ndarray:
-    """Search from waypoint to waypoint, keeping the best beginnings."""
+    """Beam search over waypoints, keeping the best prefixes."""
     places, yaws, costs = np.zeros((1, 2)), np.zeros(1), np.zeros(1)
     taken = np.zeros((1, 0), int)
     for point in points_N2:
@@ -175,20 +175,20 @@ def _nearest(table: np.ndarray, points_N2: np.ndarray) -> np.ndarray:
 
 
 compiled = propose
-"""The former name of the compiled ``propose``."""
+"""The deprecated name of the compiled ``propose``."""
 
 
 class Policy:
-    """A policy for environments: from an observation to an action, by one proposal at a time.
+    """A policy for environments: it maps an observation to an action, from one proposal at a time.
 
-    It remembers the pictures of an episode: call ``reset`` where another begins.
+    It stores the images of an episode: call ``reset`` at the start of another.
 
     Args:
         config: the policy.
         params: its parameters.
-        actions: what a discrete action does; None acts continuously.
-        steps: actions taken of a proposal before the next is made.
-        seed: of the proposals.
+        actions: the motion of a discrete action; None for continuous actions.
+        steps: number of actions taken from a proposal before the next proposal.
+        seed: seed of the proposals.
     """
 
     def __init__(
@@ -211,7 +211,7 @@ class Policy:
         self.made = 0
 
     def reset(self) -> None:
-        """Forget what was seen."""
+        """Discard the stored images."""
         self.seen.clear()
         self.waiting = []
 
@@ -219,8 +219,8 @@ class Policy:
         """Return an action: an integer, or (dx, dy, dyaw).
 
         Args:
-            observation: ``rgb``, and ``goal`` where it is a picture; a goal of another kind, or
-                none, is not looked at, and the policy explores.
+            observation: ``rgb``, and ``goal`` if it is an image; without a goal image the policy
+                explores.
         """
         self.seen.append(np.asarray(observation["rgb"]))
         if not self.waiting:

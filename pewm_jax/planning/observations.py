@@ -1,4 +1,4 @@
-"""What environments show and take, and observations as the frames that worlds take.
+"""Observation and action spaces, and conversion of observations to the frames that worlds take.
 
 An observation is a dictionary:
 
@@ -6,7 +6,7 @@ An observation is a dictionary:
     depth  (H, W) float32, metres along z, 0 = no measurement
     pose   (4, 4) float32, world_from_camera, OpenCV axes, z up, metres
     goal   (2,) float32, metres forward and metres left of the agent (task ``point``), or
-           (H, W, 3) uint8, what is seen at the goal (task ``image``)
+           (H, W, 3) uint8, the image at the goal (task ``image``)
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.types import Camera, Frames
 
 FARTHEST_M = 1e4
-"""Bound of positions in the spaces, which must have one, metres."""
+"""Bound of positions in the spaces, which must be bounded, metres."""
 _ROUNDING = 1e-6
 
 
 def observation_space(config: HouseConfig) -> gymnasium.spaces.Dict:
-    """Return the space of observations, see above."""
+    """Return the observation space; see the module docstring."""
     size = (config.height, config.width)
     box = gymnasium.spaces.Box
     image = box(0, 255, (*size, 3), np.uint8)
@@ -57,17 +57,17 @@ def require_action(config: HouseConfig, action: Any) -> np.ndarray:
     """Return an action as (dx, dy, dyaw), float64.
 
     Args:
-        config: says which actions there are.
+        config: defines the action space.
         action: 0, 1 or 2; or three numbers.
 
     Raises:
-        UserError: it is none of the space, or not finite.
+        UserError: it is not in the space, or not finite.
     """
     if config.actions == "discrete":
         value = np.asarray(action)
         known = ", ".join(f"{number} {name}" for number, name in enumerate(NAMES))
         if value.size != 1 or value.dtype.kind not in "iu" or not 0 <= value.item() < len(NAMES):
-            raise UserError(f"step() got the action {action!r}; there is {known}.")
+            raise UserError(f"step() got the action {action!r}; choose from {known}.")
         return discrete_table(config.action_config)[value.item()].astype(np.float64)
     high = [config.step_m, config.step_m, math.radians(config.turn_deg)]
     try:
@@ -83,7 +83,7 @@ def require_action(config: HouseConfig, action: Any) -> np.ndarray:
 
 
 def goal_in_frame(planar_3: np.ndarray, goal_xy: np.ndarray) -> np.ndarray:
-    """Return a goal (2,) float32 seen from the agent: metres forward, metres left."""
+    """Return a goal (2,) float32 relative to the agent: metres forward, metres left."""
     cos, sin = math.cos(planar_3[2]), math.sin(planar_3[2])
     x, y = np.asarray(goal_xy, np.float64) - np.asarray(planar_3[:2], np.float64)
     return np.array([cos * x + sin * y, -sin * x + cos * y], np.float32)
@@ -100,7 +100,7 @@ def frames_of(observations: Sequence[Mapping[str, Any]], intrinsics_4: np.ndarra
     """Return observations as frames, for ``worlds.start`` and ``worlds.observe``.
 
     Args:
-        observations: S ≥ 1 of them, in order; the last one is the present.
+        observations: S ≥ 1 observations, in order; the last one is the present.
         intrinsics_4: (4,) fx, fy, cx, cy: ``env.unwrapped.intrinsics_4``.
 
     Raises:

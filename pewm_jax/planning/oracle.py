@@ -1,4 +1,4 @@
-"""An oracle for the house: it has the map and walks a shortest path to the goal.
+"""An oracle for the house: it knows the navigation grid and follows a shortest path to the goal.
 
 It is an upper bound for policies, and a source of demonstrations::
 
@@ -25,24 +25,24 @@ from pewm_jax.planning.house import HouseEnv
 TURN_STEPS = 0.25
 """Cost of a turn, in forward steps."""
 HEURISTIC_WEIGHT = 1.3
-"""Weight of A*'s estimate: above 1 the search is much faster and its path a little longer."""
+"""Weight of A*'s heuristic: above 1 the search is much faster and its path slightly longer."""
 SAME_M = 0.05
-"""Places this near to each other, with one heading, are one place to the search, metres."""
+"""Positions closer than this with the same heading are one node of the search, metres."""
 
 
 def actions(env: gymnasium.Env) -> list[Any]:
-    """Return the actions that lead from where the agent is to the goal.
+    """Return the actions from the agent's pose to the goal.
 
-    A* over forward steps and turns, guided by the distance on foot; as nothing in the house is
-    random, they reach it. In a house with continuous actions they are the rows of the discrete
-    table.
+    A* over forward steps and turns, guided by the geodesic distance; the house is deterministic, so
+    these actions reach the goal. For a house with continuous actions they are the rows of the
+    discrete actions' table.
 
     Args:
         env: a house within an episode, wrapped or not.
 
     Raises:
-        UserError: it is no house, no episode has begun, or steps of this length and angle do not
-            get there.
+        UserError: it is not a house, no episode has started, or steps of this length and angle
+            cannot reach the goal.
     """
     house = env.unwrapped
     if not isinstance(house, HouseEnv):
@@ -68,7 +68,7 @@ def _search(house: HouseEnv) -> list[int]:
         if key in closed:
             continue
         closed.add(key)
-        # From cell to cell a way is up to 8 % longer; only where that is near is it measured.
+        # Grid distances are up to 8 % too long; compute the exact one only near the goal.
         row, column = house.grid.cell_of(planar[:2])
         near = ways.distance_YX[row, column] <= 1.1 * config.success_m + 2 * house.grid.cell_m
         near = near and ways.length(planar[:2]) <= config.success_m
@@ -90,7 +90,7 @@ def _search(house: HouseEnv) -> list[int]:
 
 
 def _estimate(house: HouseEnv, planar: np.ndarray) -> float:
-    """Return an estimate of the remaining forward steps, from cell to cell."""
+    """Return an estimate of the remaining forward steps, from grid distances."""
     ways = house.task.ways
     row, column = house.grid.cell_of(planar[:2])
     left = float(ways.distance_YX[row, column]) - house.config.success_m
@@ -105,7 +105,7 @@ def _key(planar: np.ndarray, turn_deg: float) -> tuple[int, int, int]:
 
 
 def _traced(came: dict[int, tuple[int, int]], number: int) -> list[int]:
-    """Return the actions that led to a node of the search."""
+    """Return the actions that lead to a node of the search."""
     done = []
     while number:
         number, action = came[number]

@@ -1,9 +1,9 @@
-"""Plan: draw candidates, compute their costs, update the planner, and repeat.
+"""Planning loop: sample candidates, compute their costs, update the planner, and repeat.
 
-``search`` is pure and jitted whole, for costs that JAX can trace. ``plan`` is the same loop on the
-host, for costs of any kind: it shows progress, refuses costs that are NaN or −inf, and resumes an
-interrupted search. Both draw a round's randomness from the key and the round's number alone: the
-same key gives the same plan.
+``search`` is pure and jitted as a whole, for costs that JAX can trace. ``plan`` is the same loop on
+the host, for any cost: it shows progress, raises an error for costs that are NaN or −inf, and
+resumes an interrupted search. Both derive a round's randomness only from the key and the round's
+number: the same key gives the same plan.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from pewm_jax.planning.settings import PlanConfig, Planner
 from pewm_jax.types import Array
 
 Cost: TypeAlias = Callable[[Array, Array], Array]
-"""``(actions_KN, key) -> costs_K``, the lower the better; continuous actions are (K, N, A)."""
+"""``(actions_KN, key) -> costs_K``, lower is better; continuous actions are (K, N, A)."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Rounds:
-    """What every round found.
+    """Statistics of every round.
 
     Attributes:
         least_R: (R,) the lowest cost of the round.
         mean_R: (R,) the mean of its finite costs.
         best_R: (R,) the lowest cost so far.
-        spread_R: (R,) spread of the planner's distribution afterwards: its entropy relative to the
-            uniform one's, or the mean standard deviation.
+        spread_R: (R,) spread of the planner's distribution after the round: its entropy relative to
+            the uniform distribution's, or the mean standard deviation.
     """
 
     least_R: Array
@@ -58,7 +58,7 @@ class Plan:
 
     Attributes:
         actions: (N,) discrete or (N, A) continuous actions.
-        choices: (H,) or (H, A) the same, block by block.
+        choices: (H,) or (H, A) the choice of each block.
         cost: () its cost.
         rounds: statistics of every round.
     """
@@ -70,7 +70,7 @@ class Plan:
 
 
 def _keys(key: Array, number: Array | int) -> tuple[Array, Array]:
-    """Return a round's keys: of the proposals, of the costs."""
+    """Return a round's keys: for the proposals and for the costs."""
     drawn, judged = jax.random.split(jax.random.fold_in(key, number))
     return drawn, judged
 
@@ -78,7 +78,7 @@ def _keys(key: Array, number: Array | int) -> tuple[Array, Array]:
 def _learn(
     planner: Planner, config: PlanConfig, search: Search, choices: Array, costs: Array
 ) -> tuple[Search, Rounds]:
-    """Update the search; return also the round's statistics."""
+    """Update the search and return it with the round's statistics."""
     after = planners.update(planner, config, search, choices, costs)
     finite = jnp.isfinite(costs)
     mean = jnp.where(finite, costs, 0).sum() / jnp.maximum(finite.sum(), 1)
@@ -97,7 +97,7 @@ def search(
 ) -> Plan:
     """Plan with a cost that JAX can trace; pure: jit it, vmap it over keys and goals.
 
-    Costs that are no numbers count as worst; ``plan`` refuses them.
+    NaN costs count as worst; ``plan`` raises an error for them.
 
     Args:
         planner: the planner.
@@ -154,15 +154,15 @@ def plan(
     Args:
         planner: the planner.
         config: the size of the search.
-        cost_of_actions: see ``Cost``; it is called once a round and need not be pure. inf excludes
-            a candidate.
+        cost_of_actions: see ``Cost``; it is called once per round and need not be pure. inf
+            excludes a candidate.
         key: randomness.
         start: see ``planners.init``.
         checkpoint: a file that is rewritten after every round. The same call resumes from it, or
             returns the finished plan. A file of a search with other settings, key, start or
-            ``about`` is refused.
+            ``about`` is an error.
         about: what the cost depends on, for the checkpoint, such as a hash of state and goal.
-        progress: show it.
+        progress: whether to show progress.
 
     Raises:
         UserError: costs are NaN or −inf or of another shape, no candidate has a finite cost, or the
@@ -190,8 +190,8 @@ def plan(
                 meter.advance(config.candidates)
     if not np.isfinite(float(found.cost)):
         raise UserError(
-            f"no candidate of {config.rounds} rounds has a finite cost, so there is nothing to "
-            "choose: look at the cost, or allow other actions."
+            f"no candidate of {config.rounds} rounds has a finite cost, so no plan can be chosen: "
+            "check the cost, or allow other actions."
         )
     return _finished(config, found, jax.tree.map(lambda *x: jnp.stack(x), *made))
 
@@ -212,7 +212,7 @@ def _arrays_of(search: Search, rounds: list[Rounds]) -> dict[str, np.ndarray]:
 
 
 def _resumed(arrays: dict[str, np.ndarray] | None, begun: Search) -> tuple[Search, list[Rounds]]:
-    """Return the state and the rounds of ``_arrays_of``; of None those of a new search."""
+    """Return the state and the rounds from ``_arrays_of``; for None, those of a new search."""
     if arrays is None:
         return begun, []
     leaves, tree = jax.tree.flatten(begun)
@@ -225,7 +225,7 @@ def checked(costs: Any, count: int, number: int | None = None) -> np.ndarray:
     """Return costs as (K,) float32 numbers.
 
     Args:
-        costs: what a cost returned.
+        costs: the result of a cost.
         count: K.
         number: the round, for the message, if there are rounds.
 
@@ -237,14 +237,14 @@ def checked(costs: Any, count: int, number: int | None = None) -> np.ndarray:
     if values.shape != (count,):
         raise UserError(
             f"{where}the cost of {count} candidates has shape {values.shape}: return one number "
-            "for each."
+            "per candidate."
         )
     wrong = np.flatnonzero(np.isnan(values) | (values == -np.inf))
     if len(wrong):
         named = ", ".join(map(str, wrong[:8])) + (" …" if len(wrong) > 8 else "")
         raise UserError(
-            f"{where}the cost of {len(wrong)} of {count} candidates ({named}) is no number: the "
-            "model imagined, or the cost made, NaN or −inf of their actions; look at what is "
-            "imagined of them by pewm_jax.imagine, and at the cost of one frame."
+            f"{where}the cost of {len(wrong)} of {count} candidates ({named}) is NaN or −inf: the "
+            "model imagined, or the cost computed, values that are not finite; check the frames "
+            "from pewm_jax.imagine for these actions, and the cost of one frame."
         )
     return values

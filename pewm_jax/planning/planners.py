@@ -1,4 +1,4 @@
-"""Planners: propose candidates, and update their distribution from costs; no model, no cost.
+"""Planners: propose candidates, and update their distribution from costs, without a model.
 
 Three pure functions drive every planner::
 
@@ -6,9 +6,9 @@ Three pure functions drive every planner::
     choices_KH = propose(planner, config, search, key)      # K candidates of H blocks
     search = update(planner, config, search, choices_KH, costs_K)
 
-``plan.plan`` loops over them. The best candidate of all rounds is kept in ``search.best``.
-Candidate 0 is the distribution's own mode or mean; in the first round these are the choices that
-the search starts from.
+``plan.plan`` loops over them. The best candidate of all rounds is stored in ``search.best``.
+Candidate 0 is the mode or mean of the distribution; in the first round, the choices that the search
+starts from.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class Search:
 
     Attributes:
         belief: (H, A) probabilities of discrete actions, or ``Normals``.
-        best: (H,) or (H, A) the best choices so far; at first the belief's mode.
+        best: (H,) or (H, A) the best choices so far; initially the belief's mode.
         cost: () their cost, inf before the first round.
-        kept_EH: (E, H) or (E, H, A) the best different choices so far, which count in the next
-            round, too.
-        kept_costs_E: (E,) their costs, inf in free places.
+        kept_EH: (E, H) or (E, H, A) the best distinct choices so far, which also count in the next
+            round.
+        kept_costs_E: (E,) their costs, inf for unused slots.
     """
 
     belief: Any
@@ -61,17 +61,17 @@ class Search:
 
 
 def init(planner: Planner, config: PlanConfig, start: Array | None = None) -> Search:
-    """Begin a search.
+    """Return the initial state of a search.
 
     Args:
         planner: the planner.
         config: the size of a plan.
-        start: (h,) discrete choices or (h, A) continuous ones to begin around, such as the rest of
-            an earlier plan (``shifted``); h < H leaves the last blocks open. None begins uniformly,
-            or at the middle of the bounds.
+        start: (h,) discrete choices or (h, A) continuous ones to start around, such as the rest of
+            an earlier plan (``shifted``); h < H leaves the last blocks open. None starts with a
+            uniform distribution, or at the middle of the bounds.
 
     Raises:
-        UserError: ``start`` has no such shape.
+        UserError: ``start`` has another shape.
     """
     space, blocks = planner.space, config.horizon
     if isinstance(space, Discrete):
@@ -92,7 +92,7 @@ def init(planner: Planner, config: PlanConfig, start: Array | None = None) -> Se
 
 
 def kept(planner: Planner, config: PlanConfig) -> int:
-    """Return E, the candidates that a planner keeps from round to round."""
+    """Return E, the number of candidates that a planner keeps between rounds."""
     return round(getattr(planner, "keep", 0.0) * config.elites)
 
 
@@ -101,7 +101,7 @@ START_PROBABILITY = 0.5
 
 
 def _around(planner: Planner, belief: Any, start: Array, blocks: int) -> Any:
-    """Return a belief around the choices to begin with."""
+    """Return a belief around the start choices."""
     space = planner.space
     wide = () if isinstance(space, Discrete) else (len(space.low),)
     if start.ndim != 1 + len(wide) or len(start) > blocks or start.shape[1:] != wide:
@@ -109,14 +109,14 @@ def _around(planner: Planner, belief: Any, start: Array, blocks: int) -> Any:
             f"a plan cannot start from choices of shape {start.shape}: give at most {blocks} "
             f"blocks of shape {wide}."
         )
-    given = len(start)
+    length = len(start)
     if isinstance(space, Discrete):
         sure = jax.nn.one_hot(start, space.count)
-        return belief.at[:given].set(
+        return belief.at[:length].set(
             START_PROBABILITY * sure + (1 - START_PROBABILITY) / space.count
         )
     low, high = bounds(space)
-    return Normals(belief.mean_HA.at[:given].set(jnp.clip(start, low, high)), belief.std_HA)
+    return Normals(belief.mean_HA.at[:length].set(jnp.clip(start, low, high)), belief.std_HA)
 
 
 def propose(planner: Planner, config: PlanConfig, search: Search, key: Array) -> Array:
@@ -125,14 +125,14 @@ def propose(planner: Planner, config: PlanConfig, search: Search, key: Array) ->
     Args:
         planner: the planner.
         config: the size of a plan, and K.
-        search: the search so far.
+        search: the state of the search.
         key: randomness.
     """
     belief = search.belief
     shape = (config.candidates, config.horizon)
     drawn = _drawn(planner, belief, shape, key)
     first = mode(belief)
-    if isinstance(planner, RandomShooting):  # it believes the same in every round
+    if isinstance(planner, RandomShooting):  # its distribution never changes
         first = jnp.where(jnp.isfinite(search.cost), drawn[0], first)
     return drawn.at[0].set(first)
 
@@ -154,15 +154,15 @@ def _drawn(planner: Planner, belief: Any, shape: tuple[int, int], key: Array) ->
 def update(
     planner: Planner, config: PlanConfig, search: Search, choices_KH: Array, costs_K: Array
 ) -> Search:
-    """Learn from a round's costs.
+    """Update the search with a round's costs.
 
     Args:
         planner: the planner.
-        config: how many elites.
-        search: the search so far.
+        config: the number of elites.
+        search: the state of the search.
         choices_KH: (K, H) or (K, H, A) choices.
-        costs_K: (K,) their costs, the lower the better; NaN and inf count as worst. Choices that
-            are the same count once.
+        costs_K: (K,) their costs, lower is better; NaN and inf count as worst. Duplicate choices
+            count once.
     """
     costs = jnp.where(jnp.isfinite(costs_K), costs_K, jnp.inf).astype(jnp.float32)
     least = jnp.argmin(costs)
@@ -176,20 +176,20 @@ def update(
     costs = jnp.where(repeated(choices), jnp.inf, costs)
     weights = importance(planner, config, costs)
     belief = _fitted(planner, search.belief, choices, weights)
-    some = jnp.isfinite(costs).any()  # or nothing was learned
+    some = jnp.isfinite(costs).any()  # otherwise nothing was learned
     belief = jax.tree.map(lambda new, old: jnp.where(some, new, old), belief, search.belief)
     stays = jnp.argsort(costs, stable=True)[: kept(planner, config)]
     return Search(belief, best, cost, choices[stays], costs[stays])
 
 
 def repeated(choices: Array) -> Array:
-    """Return which of (n, …) choices are equal to one before them, (n,) bool."""
+    """Return which of (n, …) choices duplicate an earlier one, (n,) bool."""
     flat = choices.reshape(len(choices), -1)
     return jnp.tril((flat[:, None] == flat[None]).all(-1), -1).any(1)
 
 
 def _fitted(planner: CEM | MPPI, belief: Any, choices_KH: Array, weights_K: Array) -> Any:
-    """Return the belief that is fitted to weighted choices, with momentum."""
+    """Return the belief fitted to weighted choices, with momentum."""
     stays, learned = planner.momentum, 1 - planner.momentum
     if isinstance(planner.space, Discrete):
         count = planner.space.count
@@ -204,7 +204,7 @@ def _fitted(planner: CEM | MPPI, belief: Any, choices_KH: Array, weights_K: Arra
 
 
 def importance(planner: Planner, config: PlanConfig, costs_K: Array) -> Array:
-    """Return (K,) how much each candidate counts, together 1; those of infinite cost do not."""
+    """Return the (K,) weights of candidates, which sum to 1; 0 for infinite costs."""
     finite = jnp.isfinite(costs_K)
     if isinstance(planner, MPPI):
         count = jnp.maximum(finite.sum(), 1)
@@ -228,7 +228,7 @@ def mode(belief: Any) -> Array:
 
 
 def spread(space: Discrete | Box, belief: Any) -> Array:
-    """Return how undecided a belief is: its entropy over the uniform one's, or its mean std."""
+    """Return a belief's spread: entropy relative to the uniform one's, or mean std."""
     if isinstance(belief, Normals):
         return belief.std_HA.mean()
     assert isinstance(space, Discrete)
@@ -240,14 +240,14 @@ def actions_of(config: PlanConfig, choices: Array) -> Array:
     """Return the actions (…, N) of choices (…, H): each block's is repeated.
 
     Args:
-        config: has ``action_block``.
+        config: ``action_block`` is used.
         choices: (K, H, …) choices; a single plan needs a leading axis.
     """
     return jnp.repeat(choices, config.action_block, axis=1)
 
 
 def shifted(config: PlanConfig, choices_H: Array) -> Array:
-    """Return the blocks of a plan that are left when its first ones were carried out, or none."""
+    """Return the blocks of a plan that remain after its first ones were executed, or none."""
     return choices_H[config.receding_horizon or config.horizon :]
 
 

@@ -1,13 +1,13 @@
-"""Practice: a policy walks inside a world, and what it sees there are walks to learn from.
+"""Practice: a policy acts inside a world, and the imagined walks become training data.
 
-A few posed pictures of a place begin a world. From one of them the policy chooses actions, the
-world imagines what is then seen and remembers it, and so on (paper, Section 3.3). Every later
-picture of such a walk is a goal that the walk reached (hindsight relabelling): NoMaD's loss learns
-from any walk in this way.
+A few posed images of a place start a world. From one of them the policy chooses actions, the world
+imagines and stores the resulting frames, and so on (paper, Section 3.3). Every later image of such
+a walk is a goal that the walk reached (hindsight relabelling): NoMaD's loss can be trained on any
+walk in this way.
 
-A world knows no walls, but the given pictures have depth: where something that they show stands in
-the way of a step forward, the rest of the block is a turn on the spot (``FloorMap``). So walls are
-the same whatever the world imagines.
+A world has no collision detection, but the given images have depth: if an observed obstacle blocks
+a forward step, the rest of the block becomes a turn in place (``FloorMap``). So obstacles do not
+depend on what the world imagines.
 """
 
 from __future__ import annotations
@@ -39,28 +39,29 @@ from pewm_jax.types import Frames, Params
 
 CELL_M = 0.05
 RADIUS_M = 0.27
-"""Points nearer than this to the middle of the way block it."""
+"""Distance from the line of motion within which points block it, metres."""
 ABOVE_FLOOR_M, ABOVE_CAMERA_M = 0.2, 0.1
-"""Points lower than the first, or higher above the camera than the second, block nothing."""
+"""Points lower than the first, or higher above the camera than the second, are not obstacles."""
 LEAST_POINTS = 3
-"""Points that make a cell occupied: single ones are errors of measured or imagined depth."""
+"""Number of points that make a cell occupied: single ones are errors of measured or imagined
+depth."""
 FLOOR_PERCENTILE = 1.0
-"""Percentile of the points' heights that is taken for the floor."""
+"""Percentile of the points' heights used as the floor."""
 WAY_SAMPLES = 6
-"""Positions along a way that are checked."""
+"""Number of positions along a move that are checked."""
 FARTHEST_M = 6.0
-"""Points farther from the camera are left out: their position is uncertain."""
+"""Points farther from the camera are ignored, because their position is uncertain, metres."""
 Act: TypeAlias = Callable[[np.ndarray, np.ndarray | None, jax.Array], np.ndarray]
-"""``act(rgb_SHWC, goal_HWC, key) -> (N,)`` discrete actions: pictures seen, the present last, and
-the picture of a goal or None."""
+"""``act(rgb_SHWC, goal_HWC, key) -> (N,)`` discrete actions, from observed images (the present
+last) and a goal image or None."""
 
 
 class FloorMap:
     """Occupied cells of the floor, from the posed depth of all frames that were added.
 
-    A camera does not see what stands beside the agent's feet, so one image is not enough: all
-    earlier frames count. Everything between the floor and a little above the camera is an obstacle.
-    The floor is the lowest level with many points.
+    A camera does not see obstacles beside the agent's feet, so one image is not enough: all earlier
+    frames are used. Everything between the floor and slightly above the camera is an obstacle. The
+    floor is the lowest level with many points.
     """
 
     def __init__(self) -> None:
@@ -85,7 +86,7 @@ class FloorMap:
         self._cells = None
 
     def free(self, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
-        """Tell whether a straight way has no obstacle in it."""
+        """Return whether the straight line between two points has no obstacle."""
         cells = self._occupied()
         reach = int(np.ceil(RADIUS_M / CELL_M)) + 1
         around = np.arange(-reach, reach + 1)
@@ -102,7 +103,7 @@ class FloorMap:
         return True
 
     def _occupied(self) -> set[tuple[int, int]]:
-        """Return the cells with obstacles, computed at first use."""
+        """Return the cells with obstacles, computed on first use."""
         if self._cells is None:
             points = self._points
             if not len(points):
@@ -121,13 +122,13 @@ class FloorMap:
 
 @dataclasses.dataclass(frozen=True)
 class Practice:
-    """How a policy practises.
+    """Settings of practice.
 
     Attributes:
-        walks: how many.
-        blocks: proposals that are carried out in a walk, one after the other.
-        with_goal: share of walks that have the picture of a goal before them, one of those that the
-            world began with; in the others the policy explores.
+        walks: number of walks.
+        blocks: number of consecutive proposals executed in a walk.
+        with_goal: share of walks with a goal image, one of those that the world was started with;
+            in the others the policy explores.
     """
 
     walks: int = 32
@@ -147,7 +148,7 @@ class Practice:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PracticeWalk:
-    """What was seen and done.
+    """A walk: frames and actions.
 
     Attributes:
         frames: (T,) NumPy frames, colours uint8.
@@ -159,39 +160,39 @@ class PracticeWalk:
 
 
 class PracticeEnvironment(Protocol):
-    """Where a policy practises: a world, or a simulator."""
+    """An environment for practice: a world, or a simulator."""
 
     def begin(self, number: int) -> tuple[Any, Frames]:
-        """Return the state at the pose of a given picture, and that picture."""
+        """Return the state at the pose of a given image, and that image."""
         ...
 
     def possible(self, state: Any, actions_N: np.ndarray) -> int:
-        """Return the number of actions before the first that leads into something; N if none."""
+        """Return the number of actions before the first collision; N if there is none."""
         ...
 
     def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames]:
-        """Return the state after N actions, and what was seen."""
+        """Return the state after N actions, and the frames."""
         ...
 
 
 def walks(
     place: PracticeEnvironment, seen: Frames, act: Act, practice: Practice, seed: int
 ) -> Iterator[PracticeWalk]:
-    """Let a policy walk.
+    """Yield walks of a policy.
 
     Args:
-        place: where.
-        seen: the pictures that the place was begun with; walks start at one of them.
+        place: the environment.
+        seen: the images with which the place was started; walks start at one of them.
         act: the policy.
-        practice: how many and how long.
-        seed: of starts, goals and actions; equal seeds begin equally in every place.
+        practice: number and length of walks.
+        seed: seed of starts, goals and actions; equal seeds give equal starts in every environment.
 
     Returns:
-        The walks, made as they are asked for; each has the same number of frames if the policy
-        proposes as many actions each time.
+        The walks, generated lazily; all have the same number of frames if the policy always
+        proposes the same number of actions.
 
     Raises:
-        UserError: the policy gives something else than discrete actions.
+        UserError: the policy does not return discrete actions.
     """
     for number in range(practice.walks):
         rng, key = np.random.default_rng((seed, number)), jax.random.key(seed)
@@ -214,12 +215,12 @@ def walks(
 
 
 class ImaginedEnvironment:
-    """A world as a place to practise in.
+    """A world as an environment for practice.
 
     Args:
         config: the world.
         params: its weights.
-        seen: posed RGB-D frames that it begins with.
+        seen: posed RGB-D frames with which it starts.
         memory: False ignores what it remembers.
     """
 
@@ -230,7 +231,7 @@ class ImaginedEnvironment:
         self.floor.add(seen)
 
     def begin(self, number: int) -> tuple[Any, Frames]:
-        """Begin with all that was seen; the given picture is the present."""
+        """Start from all images; the given one is the present."""
         count = len(self.seen.depth_THW)
         order = np.array([*(n for n in range(count) if n != number), number])
         seen = jax.tree.map(lambda x: np.asarray(x)[order], self.seen)
@@ -238,7 +239,7 @@ class ImaginedEnvironment:
         return state, jax.tree.map(lambda x: x[-1:], seen)
 
     def possible(self, state: Any, actions_N: np.ndarray) -> int:
-        """Look at what the given pictures show to be in the way."""
+        """Check moves against the obstacles in the given images."""
         pose = planar(np.asarray(state.frame.camera.world_from_camera)[0])
         for number, action in enumerate(actions_N):
             after = advance(pose, self.table_A3[int(action)])
@@ -248,7 +249,7 @@ class ImaginedEnvironment:
         return len(actions_N)
 
     def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames]:
-        """Imagine, and remember."""
+        """Imagine the frames and insert them into the memory."""
         state, frames = worlds.imagine(
             self.config.model, self.params, state, actions_N, key, memory=self.memory
         )
@@ -258,11 +259,11 @@ class ImaginedEnvironment:
 
 
 class SimulatedEnvironment:
-    """A simulator as a place to practise in: the same number of real walks.
+    """A simulator as an environment for practice: equally many real walks.
 
     Args:
         simulator: the house.
-        motion: what an action does.
+        motion: the motion of an action.
         seen: frames whose poses walks start from.
     """
 
@@ -271,12 +272,12 @@ class SimulatedEnvironment:
         self.table_A3 = discrete_table(motion).astype(np.float64)
 
     def begin(self, number: int) -> tuple[Any, Frames]:
-        """Stand where a given picture was taken."""
+        """Start at the pose of a given image."""
         here = jax.tree.map(lambda x: np.asarray(x)[number : number + 1], self.seen)
         return planar(here.camera.world_from_camera[0]), here
 
     def possible(self, state: Any, actions_N: np.ndarray) -> int:
-        """Walk until something stands in the way."""
+        """Simulate moves until a collision."""
         for number, action in enumerate(actions_N):
             state, collided = move(self.simulator.grid, state, self.table_A3[int(action)])
             if collided:
@@ -284,7 +285,7 @@ class SimulatedEnvironment:
         return len(actions_N)
 
     def go(self, state: Any, actions_N: np.ndarray, key: jax.Array) -> tuple[Any, Frames]:
-        """Walk; walls hold."""
+        """Simulate the moves, with collisions."""
         del key
         poses = [state]
         for action in actions_N:
@@ -301,20 +302,20 @@ def require_discrete(actions_N: Any, who: str) -> np.ndarray:
     """Return a copy of discrete actions (N,).
 
     Raises:
-        UserError: they are none.
+        UserError: they are not discrete actions.
     """
     actions = np.array(actions_N)
     known = actions.dtype.kind in "iu" and actions.ndim == 1 and actions.size > 0
     if not known or not ((actions >= 0) & (actions < len(NAMES))).all():
         raise UserError(
-            f"{who} gave {actions.dtype} of shape {actions.shape}: give whole numbers from 0 to "
-            f"{len(NAMES) - 1}, one for each action."
+            f"{who} gave {actions.dtype} of shape {actions.shape}: give integers from 0 to "
+            f"{len(NAMES) - 1}, one per action."
         )
     return actions
 
 
 def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Act:
-    """Return NoMaD as an ``Act``: one proposal, as the discrete actions nearest to it."""
+    """Return NoMaD as an ``Act``: one proposal, converted to discrete actions."""
 
     def act(rgb_SHWC: np.ndarray, goal_HWC: np.ndarray | None, key: jax.Array) -> np.ndarray:
         seen = nomad_policy.history(config, rgb_SHWC)

@@ -1,11 +1,10 @@
-"""How near an agent came to its goal, and by which way: ATE, RPE, final errors, SIM, success, SPL.
+"""Scores of a trajectory relative to a goal: ATE, RPE, final errors, SIM, success, SPL.
 
 Trajectories are cameras (T, 4, 4), ``world_from_camera``, or planar poses (T, 3), x, y, yaw; two
-that are compared have the same number of frames and one world: nothing is aligned. NumPy float64.
-
-ATE and RPE are those of ``evo`` (its ``APE`` and ``RPE`` of the translation part, root mean square,
-RPE from each frame to the next), as in Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
-systems", IROS 2012.
+compared trajectories must have the same number of frames and the same world frame: they are not
+aligned. NumPy float64. ATE and RPE are those of ``evo`` (its ``APE`` and ``RPE`` of the translation
+part, root mean square, RPE from each frame to the next), as in Sturm et al., "A benchmark for the
+evaluation of RGB-D SLAM systems", IROS 2012.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from numpy.typing import ArrayLike
 from pewm_jax.config import UserError
 
 LEAST_TASK_M = 0.25
-"""Tasks shorter than one step count as this long where an error is put in relation to the task."""
+"""Lower bound of a task's length where errors are relative to it, metres; one step."""
 
 
 def ate(reference: ArrayLike, estimate: ArrayLike) -> float:
@@ -39,7 +38,7 @@ def ate(reference: ArrayLike, estimate: ArrayLike) -> float:
 def rpe(reference: ArrayLike, estimate: ArrayLike) -> float:
     """Return the relative pose error: root mean square translation error per step, metres.
 
-    The motion from each frame to the next, seen from the first of the two, is compared.
+    It compares the motion from each frame to the next, in the coordinates of the first of the two.
 
     Args:
         reference: (T, 4, 4) or (T, 3), T ≥ 2.
@@ -55,7 +54,7 @@ def rpe(reference: ArrayLike, estimate: ArrayLike) -> float:
 
 
 def position_error(pose: ArrayLike, goal: ArrayLike) -> float:
-    """Return the straight distance between two poses (4, 4) or (3,) on the ground, metres."""
+    """Return the Euclidean distance between two poses (4, 4) or (3,) on the ground, metres."""
     here, there = _planar(pose, "position_error"), _planar(goal, "position_error")
     return math.hypot(*(here[:2] - there[:2]))
 
@@ -73,23 +72,23 @@ def path_length(trajectory: ArrayLike) -> float:
 
 
 def sim(start: ArrayLike, final: ArrayLike, goal: ArrayLike) -> float:
-    """Return how similar a final pose is to the goal, in percent.
+    """Return the similarity of a final pose to the goal, in percent.
 
-    The paper reports a "SIM" and does not say what it is. This one is ours and is not to be
-    compared with the paper's::
+    The paper reports a "SIM" without defining it. This definition is ours and is not comparable
+    with the paper's::
 
         SIM = 100 · (P + H) / 2
         P = max(0, 1 − |final − goal| / max(|start − goal|, 0.25 m))     position
         H = 1 − |heading of final − heading of goal| / π                 heading
 
-    100 is the goal itself. P measures what is left of the way in relation to the task, so tasks of
-    all lengths count alike; who stays where it was, or ends farther away, has P = 0. H is 0 for the
-    opposite heading. An agent that does nothing in a task without a turn scores 50.
+    100 is the goal itself. P measures the remaining distance relative to the task, so tasks of all
+    lengths count equally; an agent that stays in place, or ends farther away, has P = 0. H is 0 for
+    the opposite heading. An agent that does nothing in a task without a turn scores 50.
 
     Args:
-        start: (4, 4) or (3,) pose at the beginning.
-        final: where the agent ended.
-        goal: where it had to get.
+        start: (4, 4) or (3,) initial pose.
+        final: final pose of the agent.
+        goal: pose of the goal.
 
     Raises:
         UserError: the shapes do not fit, or values are not finite.
@@ -103,7 +102,7 @@ def sim(start: ArrayLike, final: ArrayLike, goal: ArrayLike) -> float:
 def success(
     final: ArrayLike, goal: ArrayLike, within_m: float = 0.5, within_deg: float = 180.0
 ) -> bool:
-    """Return whether a pose is near the goal: straight distance and heading, both inclusive."""
+    """Return whether a pose is near the goal in distance and heading, bounds included."""
     near = position_error(final, goal) <= within_m
     return bool(near and math.degrees(yaw_error(final, goal)) <= within_deg)
 
@@ -114,8 +113,8 @@ def spl(success: ArrayLike, shortest_m: ArrayLike, walked_m: ArrayLike) -> float
     Args:
         success: (N,) whether each episode succeeded, or one.
         shortest_m: (N,) L, the shortest path from start to goal.
-        walked_m: (N,) P, the path walked. It may be the shorter of the two, as an episode ends
-            within a radius of the goal.
+        walked_m: (N,) P, the path walked. It may be shorter than L, because an episode ends within
+            a radius of the goal.
 
     Raises:
         UserError: there are no episodes, the shapes differ, or a shortest path is not above 0.
@@ -124,7 +123,7 @@ def spl(success: ArrayLike, shortest_m: ArrayLike, walked_m: ArrayLike) -> float
     if won.size == 0 or not won.shape == least.shape == walked.shape:
         raise UserError(
             f"spl() got successes {won.shape}, shortest paths {least.shape} and paths "
-            f"{walked.shape}: give one of each for each of N ≥ 1 episodes."
+            f"{walked.shape}: give one of each per episode, N ≥ 1."
         )
     if not bool((least > 0).all()) or not np.isfinite([won, least, walked]).all():
         raise UserError("spl() got a shortest path that is not above 0, or values not finite.")
@@ -137,7 +136,7 @@ def _pair(
     true, made = _cameras(reference, who, least), _cameras(estimate, who, least)
     if len(true) != len(made):
         raise UserError(
-            f"{who}() got trajectories of {len(true)} and {len(made)} poses: give as many of both."
+            f"{who}() got trajectories of {len(true)} and {len(made)} poses: give equally many."
         )
     return true, made
 

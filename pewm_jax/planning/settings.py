@@ -1,4 +1,4 @@
-"""Settings of planning: how far, how many candidates, from which actions, by which planner."""
+"""Settings of planning: horizon, candidates, action space and planner."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from pewm_jax.errors import require, require_positive
 
 @dataclasses.dataclass(frozen=True)
 class PlanConfig:
-    """How far a plan reaches and how long it is searched for; the defaults are the paper's.
+    """The size of a plan and of its search; the defaults are the paper's.
 
-    A plan is a sequence of blocks. Each is one choice, carried out ``action_block`` times.
+    A plan is a sequence of blocks. Each is one choice, executed ``action_block`` times.
     """
 
     horizon: int = 8
-    """Blocks of a plan."""
+    """Number of blocks in a plan."""
     receding_horizon: int = 0
-    """Blocks that are carried out before the next plan; 0 for all."""
+    """Number of blocks executed before the next plan; 0 for all."""
     action_block: int = 1
-    """Equal actions that make a block."""
+    """Number of repetitions of a choice in a block."""
     candidates: int = 60
-    """K, candidates of a round."""
+    """K, number of candidates per round."""
     elites: int = 18
-    """The best of them, from which the next round's distribution is made."""
+    """Number of best candidates to which the next round's distribution is fitted."""
     rounds: int = 12
-    """How often candidates are drawn."""
+    """Number of rounds."""
 
     @property
     def actions(self) -> int:
-        """N, the actions of a plan."""
+        """Return N, the number of actions in a plan."""
         return self.horizon * self.action_block
 
     @property
     def carried_out(self) -> int:
-        """Number of actions that are carried out before the next plan."""
+        """Return the number of actions executed before the next plan."""
         return (self.receding_horizon or self.horizon) * self.action_block
 
     def __post_init__(self):
@@ -45,8 +45,8 @@ class PlanConfig:
         require_positive(self, "plan", *sorted(names))
         require(
             0 <= self.receding_horizon <= self.horizon,
-            f"plan.receding_horizon is {self.receding_horizon}, and a plan has {self.horizon} "
-            "blocks (plan.horizon): carry out at most as many as are planned, or 0 for all.",
+            f"plan.receding_horizon is {self.receding_horizon}, but a plan has {self.horizon} "
+            "blocks (plan.horizon): execute at most as many as are planned, or 0 for all.",
         )
         require(
             self.elites <= self.candidates,
@@ -60,7 +60,7 @@ class Discrete:
     """Actions 0 … count − 1; by default 0 forward, 1 turn left, 2 turn right."""
 
     count: int = 3
-    """How many there are."""
+    """Number of actions."""
 
     def __post_init__(self):
         """Validate."""
@@ -75,9 +75,9 @@ class Box:
     """
 
     low: tuple[float, ...] = (0.0, 0.0, -math.pi / 6)
-    """The least value of each entry: metres forward, metres left, radians counter-clockwise."""
+    """Lower bound of each entry: metres forward, metres left, radians counter-clockwise."""
     high: tuple[float, ...] = (0.25, 0.0, math.pi / 6)
-    """The greatest."""
+    """Upper bound of each entry."""
 
     def __post_init__(self):
         """Validate."""
@@ -99,28 +99,28 @@ Space: TypeAlias = Discrete | Box
 
 @dataclasses.dataclass(frozen=True)
 class Refined:
-    """What all planners have that move a distribution over actions from round to round.
+    """Settings of planners that update a distribution over actions in every round.
 
-    Of discrete actions it is one distribution for each block; of continuous ones a mean and a
-    standard deviation for each block and entry.
+    For discrete actions it is one distribution per block; for continuous ones a mean and a standard
+    deviation per block and entry.
     """
 
     space: Space = Discrete()
     """The actions to choose from."""
     momentum: float = 0.0
-    """Share of the last round's distribution that stays: new = momentum · old + (1 − momentum) ·
+    """Share of the previous distribution that is kept: new = momentum · old + (1 − momentum) ·
     fitted."""
     keep: float = 1.0
-    """Candidates that are kept and count in the next round, too, over the elites (Pinneri et al.
-    2020); 0 forgets them, which costs that change from round to round need."""
+    """Number of candidates kept for the next round, relative to the elites (Pinneri et al. 2020);
+    use 0 for costs that change from round to round."""
     smoothing: float = 0.2
-    """Share of the uniform distribution that is mixed into a fitted one, so that no discrete action
-    dies out."""
+    """Share of the uniform distribution mixed into the fitted one, so that no discrete action gets
+    probability 0."""
     initial_std: float = 0.5
-    """Standard deviation of the first round's continuous actions over half the width of their
-    bounds."""
+    """Standard deviation of continuous actions in the first round, relative to half the width of
+    their bounds."""
     min_std: float = 0.05
-    """The least standard deviation, over half the width of the bounds."""
+    """Smallest standard deviation, relative to half the width of the bounds."""
 
     def __post_init__(self):
         """Validate."""
@@ -150,15 +150,15 @@ class CEM(Refined):
 
 @dataclasses.dataclass(frozen=True)
 class MPPI(Refined):
-    """Path integrals (Williams et al. 2017): all candidates count, the better the more.
+    """Model predictive path integral (Williams et al. 2017): candidates are weighted by cost.
 
-    A candidate of cost c weighs exp(−(c − min) / (temperature · std)), with the least cost and the
-    standard deviation of the round's, so that costs may have any unit. The spread is fitted with
-    the same weights.
+    A candidate of cost c has the weight exp(−(c − min) / (temperature · std)), with the minimum and
+    the standard deviation of the round's costs, so that costs may have any unit. The spread is
+    fitted with the same weights.
     """
 
     temperature: float = 0.3
-    """The lower, the more the best count."""
+    """Lower values give the best candidates more weight."""
 
     def __post_init__(self):
         """Validate."""
@@ -171,7 +171,7 @@ class MPPI(Refined):
 
 @dataclasses.dataclass(frozen=True)
 class RandomShooting:
-    """Candidates of all rounds are drawn uniformly; the best is taken."""
+    """Candidates of all rounds are drawn uniformly; the best is chosen."""
 
     space: Space = Discrete()
     """The actions to choose from."""

@@ -83,7 +83,7 @@ def test_a_dtype_can_be_asked_for(folder, params, dtype, tmp_path):
         ({"patch_size": [14, 16]}, "patch_size \\[14, 16\\]"),
         ({"num_attention_heads": 3}, "not a multiple of dinov2.heads 3"),
         ({"num_hidden_layers": 3}, "encoder.layer.2"),
-        ({"num_hidden_layers": 1}, "of no use"),
+        ({"num_hidden_layers": 1}, "unexpected tensors"),
         ({"image_size": 42}, "position_embeddings"),
         ({"use_swiglu_ffn": True}, "weights_in"),
         ({"model_type": "dinov2"}, "num_register_tokens"),

@@ -171,7 +171,7 @@ FAULTS = {
     "a shard too many": (orphan_shard, "00099-of-00099.safetensors besides the weights of"),
     "an adapter": (adapter, "cannot be used: pytorch_lora_weights.safetensors"),
     "another pipeline": (class_of("", "model_index.json", "WanPipeline"), "'WanPipeline'"),
-    "a tensor too many": (extra_tensor, "1 tensors of no use (lora.down)"),
+    "a tensor too many": (extra_tensor, "1 unexpected tensors (lora.down)"),
     "tensors too few": (deeper, "lacks 24 tensors (transformer_blocks.2.attn1.norm_k.bias"),
     "another shape": (wider, "patch_embed.text_proj.weight (32, 12) instead of (32, 16)"),
     "whole numbers": (whole_numbers, "int8 and 16 more: weights of float32"),
@@ -196,7 +196,7 @@ FAULTS = {
         "norm_eps is 1e-06; only 1e-05 is known",
     ),
     "no tokenizer": (drop_tokenizer, "src/tokenizer does not; copy both or neither"),
-    "another text encoder": (narrow_text, "d_model 16 and the transformer takes text of 12"),
+    "another text encoder": (narrow_text, "d_model 16 but the transformer takes text of 12"),
     "truncated text encoder": (cut_text, "is damaged or truncated"),
     "unreadable tokenizer": (no_tokenizer_files, "cannot be read as a tokenizer"),
 }

@@ -71,5 +71,5 @@ def test_old_channels_keep_their_weights_wherever_they_go(
 
 def test_a_transformer_of_other_channels_is_refused():
     old = dataclasses.replace(build(2, 1, 4, image=False), in_channels=12)
-    with pytest.raises(UserError, match="takes 12 channels and gives 4"):
+    with pytest.raises(UserError, match="has 12 input and 4 output channels"):
         widen.plan(old, 4, 24)

@@ -301,7 +301,9 @@ def test_calls_at_the_wrong_time_are_refused(mesh):
     with pytest.raises(UserError, match="one of the two"):
         HouseEnv(HouseConfig(), task="image")
     wide = house(scene=mesh, min_distance_m=10.0)
-    with pytest.raises(UserError, match=r"room has no two places from 10 to 30 m .* are [2-5]\.\d"):
+    with pytest.raises(
+        UserError, match=r"room has no two places with .* from 10 to 30 m .* are [2-5]\.\d"
+    ):
         wide.reset(seed=0)
 
 

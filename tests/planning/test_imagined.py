@@ -268,7 +268,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(params):
             "start() got colours",
         ),
         (lambda: WorldModelEnv(CONFIG, params, render_mode="human"), "no render_mode 'human'"),
-        (lambda: WorldModelEnv(CodecWorldConfig(), {}), "CodecWorldConfig is no world to walk"),
+        (lambda: WorldModelEnv(CodecWorldConfig(), {}), "CodecWorldConfig has no actions"),
         (lambda: WorldModelEnv(CONFIG, params, render_mode="rgb_array").render(), "first reset"),
     ):
         with pytest.raises(UserError, match=re.escape(says)) as caught:

@@ -254,7 +254,7 @@ def test_a_checkpoint_of_another_search_and_a_damaged_one_are_refused(tmp_path):
         with pytest.raises(UserError, match="belongs to a search with other inputs"):
             other()
     file.write_bytes(file.read_bytes()[:-100])
-    with pytest.raises(UserError, match=r"damaged .*: remove it"):
+    with pytest.raises(UserError, match=r"damaged .*: delete it"):
         ours(planner, key=KEY, checkpoint=file)
 
 
@@ -276,7 +276,7 @@ def test_other_costs_that_cannot_be_planned_by_are_refused():
     planner = CEM(Discrete(5))
     with pytest.raises(UserError, match="no candidate of 6 rounds has a finite cost"):
         plan(planner, SMALL, lambda *_: np.full(10, np.inf), KEY, progress=False)
-    with pytest.raises(UserError, match="return one number for each"):
+    with pytest.raises(UserError, match="return one number per candidate"):
         plan(planner, SMALL, lambda *_: np.zeros((10, 1)), KEY, progress=False)
 
 
@@ -284,7 +284,7 @@ def test_other_costs_that_cannot_be_planned_by_are_refused():
     ("make", "says"),
     [
         (lambda: PlanConfig(horizon=0), "plan.horizon is 0"),
-        (lambda: PlanConfig(horizon=2, receding_horizon=3), "carry out at most as many"),
+        (lambda: PlanConfig(horizon=2, receding_horizon=3), "execute at most as many"),
         (lambda: PlanConfig(candidates=5, elites=6), "keep fewer or draw more"),
         (lambda: Box((0.0,), (1.0, 2.0)), "give both for"),
         (lambda: Box((1.0,), (0.0,)), "the low one first"),

@@ -323,7 +323,7 @@ def test_an_agent_remembers_what_it_really_sees_and_can_be_interrupted(tmp_path)
     step, _ = walk()
     with pytest.raises(UserError, match="belongs to a search with other inputs"):
         act(step, budget=9, folder=tmp_path, about="truth, something else")
-    with pytest.raises(UserError, match="give about="):
+    with pytest.raises(UserError, match="pass about="):
         act(step, budget=9, folder=tmp_path)
     resumed = act(step, budget=9, folder=tmp_path, about="truth, straight")
     equal(resumed.actions, done.actions)

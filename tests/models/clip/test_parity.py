@@ -69,7 +69,7 @@ def test_counted_positions_are_left_behind_and_nothing_else(pair, tmp_path):
     save_file(tensors | counted, tmp_path / "model.safetensors")
     jax.tree.map(np.testing.assert_array_equal, svd.read_image_encoder(tmp_path)[1], params)
     save_file(tensors | {"more": np.ones(1)}, tmp_path / "model.safetensors")
-    with pytest.raises(UserError, match=r"1 tensors of no use \(more\)"):
+    with pytest.raises(UserError, match=r"1 unexpected tensors \(more\)"):
         svd.read_image_encoder(tmp_path)
 
 
