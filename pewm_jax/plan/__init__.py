@@ -1,1 +1,1 @@
-"""Predict what a training needs before it starts: FLOPs, memory, time and the best mesh."""
+"""Predict the requirements of a training run in advance: FLOPs, memory, time and the best mesh."""

@@ -1,8 +1,8 @@
 """FLOPs and communication of a compiled program, counted from its HLO text.
 
-XLA's own ``cost_analysis`` counts the body of a loop once; here it counts as often as it runs. Only
-matrix products and convolutions are counted, with 2 FLOPs per multiply-add. All figures are for one
-device.
+XLA's own ``cost_analysis`` counts the body of a loop once; here it is counted once per iteration.
+Only matrix products and convolutions are counted, with 2 FLOPs per multiply-add. All figures are
+for one device.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ import numpy as np
 KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective-permute")
 """The kinds of collective communication."""
 THROUGH = ("bitcast", "copy", "convert", "transpose", "reshape")
-"""Operations that pass an array on without using its values."""
+"""Operations that forward an array without using its values."""
 
 _CALLED = re.compile(r"\b(?:calls|to_apply|body)=%?([\w.$-]+)")
 _BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
 _EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
 _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
 BITS = {"pred": 8, "s4": 4, "u4": 4, "bf16": 16, "c64": 64, "c128": 128}
-"""Bits of the types whose name does not tell."""
+"""Bits of the types whose name does not state them."""
 
 _COMPUTATION = re.compile(r"^(?:ENTRY )?%?([\w.$-]+) .*\{$")
 _NAME = re.compile(r"^\s+(?:ROOT )?%?([\w.$-]+) = ")
@@ -47,8 +47,8 @@ class Line:
 
     Attributes:
         shape: its type, such as ``f32[2,3]{1,0}``.
-        opcode: what it does, such as ``dot``.
-        operands: names of the instructions whose results it takes.
+        opcode: its opcode, such as ``dot``.
+        operands: names of the instructions whose results it uses.
         rest: its attributes, as text.
     """
 
@@ -59,7 +59,7 @@ class Line:
 
     @property
     def label(self) -> str:
-        """JAX's name for its place in the program, or nothing."""
+        """Return JAX's name for its place in the program, or ""."""
         found = _LABEL.search(self.rest)
         return found[1] if found else ""
 
@@ -85,7 +85,7 @@ class Collective:
         kind: one of ``KINDS``.
         label: JAX's name for its place in the program.
         group: one of the groups of devices that communicate, by their index in the mesh.
-        sent: bytes that a device sends in all its runs, with ring algorithms.
+        sent: bytes that a device sends in all its executions, with ring algorithms.
     """
 
     kind: str
@@ -96,13 +96,13 @@ class Collective:
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What one device does when a program runs once.
+    """The work of one device in one execution of a program.
 
     Attributes:
         products: its matrix products and convolutions.
         collectives: its communication.
-        unknown: labels of loops with products or communication whose number of runs is not in the
-            text; they count as one run.
+        unknown: labels of loops with products or communication whose number of iterations is not in
+            the text; they count as one iteration.
     """
 
     products: tuple[Product, ...]
@@ -111,7 +111,7 @@ class Program:
 
     @property
     def flops(self) -> float:
-        """FLOPs of all products."""
+        """Return the FLOPs of all products."""
         return sum(product.flops for product in self.products)
 
     def sent(self, kind: str) -> float:
@@ -120,7 +120,7 @@ class Program:
 
 
 def read(text: str) -> Program:
-    """Count what a compiled program does.
+    """Count the work of a compiled program.
 
     Args:
         text: ``compiled.as_text()``.
@@ -132,9 +132,9 @@ def read(text: str) -> Program:
     def only_sliced(
         computation: str, name: str, result_is_sliced: Callable[[], bool] = lambda: False
     ) -> bool:
-        """Tell whether every use of an array is a slice of it.
+        """Return whether every use of an array is a slice of it.
 
-        If the array is the computation's result, ``result_is_sliced`` tells it for the caller.
+        If the array is the computation's result, ``result_is_sliced`` answers for the caller.
         """
         if name == next(reversed(computations[computation])):  # the computation's result
             return result_is_sliced()
@@ -175,7 +175,7 @@ def read(text: str) -> Program:
 
 
 def _inside(line: Line, walk) -> Iterator[tuple]:
-    """Yield what an instruction calls, and how often: 0 if the text does not tell."""
+    """Yield the work of the computations that an instruction calls, with counts (0: unknown)."""
     if line.opcode == "while":
         trips = _TRIPS.search(line.rest)
         body = _CALLED.search(line.rest)
@@ -194,7 +194,7 @@ def _inside(line: Line, walk) -> Iterator[tuple]:
 
 
 def _flops(line: Line, lines: dict[str, Line]) -> float:
-    """Return the FLOPs of one instruction, without what it calls."""
+    """Return the FLOPs of one instruction, without the computations it calls."""
     matmul = line.opcode == "custom-call" and "matmul" in line.rest
     if line.opcode not in ("dot", "convolution") and not matmul:
         return 0.0
@@ -267,7 +267,7 @@ def split(text: str) -> tuple[dict[str, dict[str, Line]], str]:
     """Split a program into its computations, each its instructions by their names.
 
     Returns:
-        The computations by their names, and the name of the one that the program begins with.
+        The computations by their names, and the name of the entry computation.
     """
     computations: dict[str, dict[str, Line]] = {}
     entry, lines = "", {}

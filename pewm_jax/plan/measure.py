@@ -1,7 +1,7 @@
-"""What a stage's step computes, needs and sends, measured without its devices.
+"""Measure the computation, memory and communication of a stage's step without its devices.
 
 The real step is traced and compiled ahead of time for virtual CPU devices, from shapes alone. The
-jaxprs tell the FLOPs (``train.flops``). The compiled program tells memory and communication.
+jaxprs give the FLOPs (``train.flops``). The compiled program gives memory and communication.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from pewm_jax.train.flops import Work
 from pewm_jax.train.stages import Stage
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
-"""Compiler options that save time. They affect only machine code, which is never run."""
+"""Compiler options that save time. They affect only the generated machine code, which is never
+executed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,34 +40,34 @@ class MeshSizes:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The number of devices along each axis."""
+        """Return the number of devices along each axis."""
         return dataclasses.asdict(self)
 
     @property
     def devices(self) -> int:
-        """The number of all devices."""
+        """Return the total number of devices."""
         return math.prod(self.sizes.values())
 
     @property
     def batch(self) -> int:
-        """The number of parts that the batch is split into."""
+        """Return the number of shards of the batch."""
         return self.data * self.fsdp
 
     @property
     def abstract(self) -> AbstractMesh:
-        """A mesh without devices."""
+        """Return a mesh without devices."""
         return AbstractMesh(tuple(self.sizes.values()), tuple(self.sizes))
 
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
-    """What the compiler reports about a step on virtual CPU devices; all bytes are of one device.
+    """What the compiler reports about a step on virtual CPU devices; bytes are per device.
 
     Attributes:
         program: its products and communication.
         arguments: bytes of state and batch.
         temporary: bytes of temporary memory and new outputs.
-        mesh: the devices that it was compiled for.
+        mesh: the mesh for which it was compiled.
         seconds: time of compilation.
     """
 
@@ -78,7 +79,7 @@ class Compiled:
 
     @property
     def peak(self) -> float:
-        """Peak memory in bytes."""
+        """Return the peak memory in bytes."""
         return self.arguments + self.temporary
 
     def sent_along(self, axis: str) -> dict[str, float]:
@@ -98,8 +99,8 @@ class StepWork:
     """The work of one step of a stage, of all devices together.
 
     Attributes:
-        needed: what the mathematics needs; MFU is based on it.
-        executed: what the step executes, with what it recomputes.
+        needed: the work that the mathematics requires; MFU is based on it.
+        executed: the work that the step executes, including recomputation.
     """
 
     needed: Work
@@ -107,7 +108,7 @@ class StepWork:
 
     @property
     def recomputes(self) -> bool:
-        """Whether the backward pass recomputes part of the forward pass."""
+        """Return whether the backward pass recomputes part of the forward pass."""
         return self.executed.total > 1.01 * self.needed.total
 
     def on_device(self, mesh: MeshSizes) -> dict[str, float]:
@@ -140,8 +141,9 @@ def virtual(count: int) -> Sequence[Any]:
     devices = jax.devices("cpu")
     if len(devices) < count:
         raise UserError(
-            f"A plan for {count} devices needs a process of its own, in which JAX has not used its "
-            f"{len(devices)} yet: run `python train.py … --plan`."
+            f"A plan for {count} devices needs a process in which JAX has not been used, but here "
+            "it "
+            f"uses {len(devices)} already: run `python train.py … --plan`."
         )
     return devices[:count]
 
@@ -153,7 +155,7 @@ def work_of(config: Config, stage: Stage, traced: jax.stages.Traced, chip: Chip 
         config: the experiment.
         stage: the stage.
         traced: from ``trace``.
-        chip: where it is to run; None for a CPU.
+        chip: the target chip; None for a CPU.
     """
     config = as_on_chips(config)
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
@@ -176,7 +178,7 @@ def compile_traced(traced: jax.stages.Traced, mesh: Mesh | MeshSizes) -> Compile
 
     Args:
         traced: from ``trace``.
-        mesh: the sizes of the mesh that it was traced for.
+        mesh: the mesh for which it was traced, or its sizes.
     """
     began = time.monotonic()
     compiled = traced.lower().compile(compiler_options=QUICK)
@@ -199,13 +201,13 @@ def device_memory(compiled: Any) -> tuple[float, float]:
     """Return the bytes that a compiled program needs on one device: arguments, temporary memory."""
     memory = compiled.memory_analysis()
     if memory is None:
-        raise UserError("This JAX does not say what a compiled program needs; use 0.10 or newer.")
+        raise UserError("This JAX does not report a program's memory; use 0.10 or newer.")
     outputs = memory.output_size_in_bytes - memory.alias_size_in_bytes
     return float(memory.argument_size_in_bytes), float(memory.temp_size_in_bytes + outputs)
 
 
 def as_on_chips(config: Config) -> Config:
-    """Choose the form of the VAE's convolutions that accelerators use."""
+    """Select the VAE's convolution implementation that accelerators use."""
     codec: Any = getattr(config.model, "codec", None)  # a policy has none
     if getattr(codec, "convolution", "") != "auto":
         return config
@@ -213,6 +215,6 @@ def as_on_chips(config: Config) -> Config:
 
 
 def in_bfloat16(config: Config, values: Mapping[str, float]) -> dict[str, float]:
-    """Return what a chip sends where a CPU, which widens bfloat16 to float32, sends ``values``."""
+    """Return the bytes a chip sends, given a CPU's, which widens bfloat16 to float32."""
     factor = 0.5 if config.model.dtype == "bfloat16" else 1.0
     return {kind: factor * value for kind, value in values.items()}

@@ -1,10 +1,10 @@
-"""Plan a training for hardware that is not present: ``python train.py PRESET --plan``.
+"""Plan a training run on absent hardware: ``python train.py PRESET --plan``.
 
 The real step is traced and compiled for the requested number of virtual CPU devices, from shapes
-alone: no data is read, no weights are created, no folder is written. ``measure`` says what the step
-computes, needs and sends, ``suggest`` what that means on the chip. A network without scanned blocks
-makes so long a program that compiling it takes far longer than a plan is worth; then temporary
-memory is left out.
+alone: no data is read, no weights are created, no folder is written. ``measure`` determines the
+computation, memory and communication of the step, ``suggest`` predicts time and memory on the chip.
+A network without scanned blocks gives a program so large that compiling it takes too long for a
+plan; then temporary memory is unknown.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from pewm_jax.train.log import duration
 from pewm_jax.train.stages import Stage
 
 MOST_ARRAYS = 1000
-"""Trained arrays of parameters above which `--compiled auto` does not compile. Each has operations
-of its own, forward, backward and in the optimizer: with Stable Video Diffusion's 1,432, XLA holds
-216,000 of them, and many of its passes take seconds each."""
+"""Number of trained parameter arrays above which `--compiled auto` does not compile. Each array has
+its own operations in the forward pass, the backward pass and the optimizer: with Stable Video
+Diffusion's 1,432 arrays, XLA handles 216,000 operations, and many of its passes take seconds
+each."""
 MEMORY = (
     ("trained weights, float32", "trained"),
     ("frozen weights", "frozen"),
@@ -37,7 +38,7 @@ MEMORY = (
     ("gradients", "gradients"),
     ("activations and other temporary memory", "temporary"),
 )
-"""Label and ``Memory`` field of each line in the table of memory."""
+"""Label and ``Memory`` field of each line in the memory table."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +50,7 @@ class StagePlan:
         stage: the stage.
         chip: the kind of device.
         choice: the requested arrangement, with its memory and time.
-        compiled: the compiler's report; None where the step was not compiled.
+        compiled: the compiler's report; None if the step was not compiled.
         best: the best arrangements.
     """
 
@@ -70,7 +71,7 @@ def show(config: Config, launch: Launch, log: Callable[[str], None] = print) -> 
         log: prints a line.
 
     Raises:
-        ConfigError: the chip is not known, or the devices cannot form the mesh or share the batch.
+        ConfigError: the chip is unknown, or the mesh does not fit the devices or the batch.
         UserError: JAX already uses devices, and too few.
     """
     chip = chips.named(launch.chip)
@@ -81,7 +82,7 @@ def show(config: Config, launch: Launch, log: Callable[[str], None] = print) -> 
     virtual(launch.devices)
     plans = []
     for stage in planned:
-        wanted = _wanted(config, stage, launch)
+        wanted = _should_compile(config, stage, launch)
         if wanted:
             log(f"{stage.title}: compiling the real step for {launch.devices} devices …")
         plan = plan_stage(config, stage, sizes, chip, compiles=wanted)
@@ -105,7 +106,7 @@ def plan_stage(
         stage: the stage.
         sizes: the requested mesh.
         chip: the kind of device.
-        compiles: whether the step is compiled, which tells temporary memory and communication.
+        compiles: whether to compile the step, for temporary memory and communication.
     """
     traced = measure.trace(config, stage, virtual(sizes.devices))
     compiled = measure.compile_traced(traced, sizes) if compiles else None
@@ -115,8 +116,8 @@ def plan_stage(
     return StagePlan(config, stage, chip, choice, compiled, tuple(best))
 
 
-def _wanted(config: Config, stage: Stage, launch: Launch) -> bool:
-    """Tell whether a stage's step is to be compiled."""
+def _should_compile(config: Config, stage: Stage, launch: Launch) -> bool:
+    """Return whether to compile a stage's step."""
     if launch.compiled != "auto":
         return launch.compiled == "on"
     params = suggest.abstract_state(config, stage).params
@@ -124,11 +125,11 @@ def _wanted(config: Config, stage: Stage, launch: Launch) -> bool:
 
 
 def _why(launch: Launch) -> str:
-    """Say why a step is not compiled."""
+    """Return the reason why a step is not compiled."""
     if launch.compiled == "off":
         return "--compiled off"
     return (
-        f"it trains more than {MOST_ARRAYS} arrays, so that takes very long; --compiled on does it"
+        f"it trains more than {MOST_ARRAYS} arrays, so compilation is slow; --compiled on forces it"
     )
 
 
@@ -139,7 +140,7 @@ def lines(plan: StagePlan) -> Iterator[str]:
     yield ""
     yield (
         f"{plan.stage.title.capitalize()} on {choice.mesh.devices} × {plan.chip.name}: "
-        f"{arranged(choice)}; {clips} clips a step, {clips / choice.mesh.batch:g} a device"
+        f"{arranged(choice)}; {clips} clips per step, {clips / choice.mesh.batch:g} per device"
     )
     yield "  memory of a device"
     for label, name in MEMORY:

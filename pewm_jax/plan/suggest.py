@@ -1,9 +1,9 @@
-"""Memory and time of a stage on a mesh of one kind of device, and the meshes that suit best.
+"""Memory and time of a stage on a mesh of one kind of device, and the best meshes.
 
-State and communication of the weights follow from the shapes and the sharding rules. Temporary
-memory is that of the program compiled for the requested mesh, scaled to others. Time is a
-prediction from the chip's data sheet, not a measurement: the share of the peak that each kind of
-work reaches is assumed (``REACHED``), and communication that no computation waits for is assumed to
+State and weight communication follow from the shapes and the sharding rules. Temporary memory is
+that of the program compiled for the requested mesh, scaled to other meshes. Time is a prediction
+from the chip's data sheet, not a measurement: the fraction of the peak that each kind of work
+reaches is assumed (``REACHED``), and communication that no computation waits for is assumed to
 overlap with computation.
 """
 
@@ -28,17 +28,19 @@ from pewm_jax.train.stages import Stage
 from pewm_jax.train.step import TrainState, create
 
 MARGIN = 0.9
-"""Share of the memory that a plan may fill; the runtime and fragmentation need the rest."""
+"""Fraction of the memory that a plan may use; the runtime and fragmentation need the rest."""
 REACHED = {"linear": 0.65, "attention": 0.4, "convolution": 0.4}
-"""Assumed shares of the peak FLOPs that large products reach, from published kernel benchmarks."""
+"""Assumed fractions of peak FLOPs for large products, from published kernel benchmarks."""
 STREAMED = 0.8
-"""Assumed share of the memory bandwidth that reading and writing arrays reaches."""
+"""Assumed fraction of the memory bandwidth reached by reading and writing arrays."""
 OPTIMIZER = 10
-"""How often clipping, Adam and the average read or write each trained parameter (4 bytes)."""
+"""Number of times that clipping, Adam and the EMA read or write each trained parameter (4
+bytes)."""
 FLOAT = 4
 """Bytes of a float32."""
 SPLIT = ("tensor", "context")
-"""The mesh axes that split the work of a layer: its communication cannot overlap with its work."""
+"""Mesh axes that split the work of a layer: their communication cannot overlap with its
+computation."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,12 +67,12 @@ class Memory:
 
     @property
     def state(self) -> float:
-        """Memory of the training state and the batch."""
+        """Return the memory of the training state and the batch."""
         return self.trained + self.frozen + self.average + self.moments + self.batch
 
     @property
     def peak(self) -> float:
-        """Peak memory; without what was not measured."""
+        """Return the peak memory, without unmeasured parts."""
         return self.state + self.gradients + (self.temporary or 0.0)
 
 
@@ -101,7 +103,7 @@ class Prediction:
     clips_per_s: float
 
     def sent_of(self, kind: str) -> float:
-        """Return the bytes of one kind of communication."""
+        """Return the bytes sent in one kind of communication."""
         return sum(size for (sent_kind, _), size in self.sent.items() if sent_kind == kind)
 
 
@@ -113,7 +115,7 @@ class Arrangement:
         mesh: the number of devices along each axis.
         memory: memory of one device.
         time: predicted time of a step.
-        fits: whether the memory suffices, as far as it is known.
+        fits: whether the memory suffices, as far as known.
     """
 
     mesh: MeshSizes
@@ -123,19 +125,19 @@ class Arrangement:
 
     @property
     def flags(self) -> str:
-        """The flags of ``train.py`` that choose it."""
+        """Return the flags of ``train.py`` that select it."""
         return " ".join(f"--train.mesh.{name} {n}" for name, n in self.mesh.sizes.items())
 
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """Counts of parameters, grouped by the mesh axes that split them."""
+    """Parameter counts, grouped by the mesh axes that shard them."""
 
     split: tuple[tuple[tuple[str, ...], int], ...]
 
     @property
     def count(self) -> int:
-        """The number of all parameters."""
+        """Return the total number of parameters."""
         return sum(count for _, count in self.split)
 
     def on(self, mesh: MeshSizes) -> float:
@@ -154,7 +156,7 @@ def abstract_state(config: Config, stage: Stage) -> TrainState:
 def counts(config: Config, stage: Stage) -> dict[str, Weights]:
     """Count the parameters of a stage: trained ones, frozen ones, and frozen encoders.
 
-    The encoders are what prepares clips (``Stage.prepares_by``): no gradient passes through them.
+    The encoders prepare clips (``Stage.prepares_by``): no gradient passes through them.
     """
     params = abstract_state(config, stage).params
     specs = tree.flatten(tree.assign(worlds.sharding(config.model), params, "sharding rules"))
@@ -173,9 +175,9 @@ def memory_of(
 ) -> Memory:
     """Return the memory of one device.
 
-    Temporary memory beyond the gradients is that of the compiled program, in proportion to the
-    share of the batch, heads and tokens that a device has. In bfloat16 it is half of what the CPU,
-    which computes in float32, needs.
+    Temporary memory beyond the gradients is that of the compiled program, scaled to a device's
+    share of the batch, heads and tokens. In bfloat16 it is half of the CPU's, which computes in
+    float32.
 
     Args:
         config: the experiment.
@@ -267,12 +269,12 @@ def traffic(
 ) -> dict[tuple[str, str], float]:
     """Return the bytes that a device sends in a step, by kind and axis of the mesh.
 
-    Once per step weights are gathered for the forward pass and for the backward pass (``fsdp``),
+    Once per step, weights are gathered for the forward pass and for the backward pass (``fsdp``),
     and once more if the backward pass recomputes the forward pass in 16 bits, because XLA then does
     not merge the two gathers. Gradients are reduce-scattered (``fsdp``) and summed over copies of
     the weights (``data``, ``context``). In every pass the results of products whose contracted
-    dimension is sharded are summed over ``tensor``. What layers send along ``context`` is what the
-    compiled program sends, in proportion to a device's clips; 0 without such a program.
+    dimension is sharded are summed over ``tensor``. Communication of layers along ``context`` is
+    that of the compiled program, scaled to a device's clips; 0 without such a program.
     """
     c = counts(config, stage)
     wide = 2 if config.model.dtype == "bfloat16" else FLOAT
@@ -348,7 +350,7 @@ def arrangements(
 ) -> Iterator[MeshSizes]:
     """Yield all meshes of this many devices that can share the stage's batch and heads.
 
-    ``tensor`` divides the numbers of heads; ``context`` is given.
+    ``tensor`` divides the numbers of heads; ``context`` is fixed.
     """
     batch = stage.settings(config).batch
     heads: Mapping[str, int] = worlds.split_heads(config.model, stage)
@@ -368,10 +370,10 @@ def rank(
     work: StepWork,
     compiled: Compiled | None = None,
 ) -> list[Arrangement]:
-    """Return all arrangements of as many devices: those that fit, fastest first, then the others.
+    """Return all meshes for this number of devices: those that fit, fastest first, then the others.
 
-    If the times of two agree to two digits, the one that needs less memory comes first. Of those
-    that do not fit, the smallest comes first. ``context`` stays as requested.
+    If two times agree to two digits, the mesh that needs less memory comes first. Of those that do
+    not fit, the smallest comes first. ``context`` stays as requested.
     """
     choices = [
         assess(config, stage, other, chip, work, compiled)

@@ -1,4 +1,4 @@
-"""The picture of a step: the imagined frame, the ground truth and the frame without memory."""
+"""The image of a step: the imagined frame, the ground truth and the frame without memory."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ DARK, TILE, LIGHT, QUIET, ACCENT = (
     (140, 150, 166),
     (96, 200, 255),
 )
-"""Colours of the background, empty pictures, text, secondary text, and of imagined frames."""
+"""Colours of the background, empty images, text, secondary text, and of imagined frames."""
 WIDTH, GAP, LINE = 720, 12, 30
-"""Width of a board, space between pictures, and height of a caption, pixels."""
+"""Width of a board, space between images, and height of a caption, pixels."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def pictures(engine: Engine, session: Session) -> Pictures:
 
 
 def board(shown: Pictures, name: str) -> np.ndarray:
-    """Draw a step as one uint8 picture with even sides.
+    """Draw a step as one uint8 image with even sides.
 
     Args:
         shown: the frames.
@@ -84,7 +84,7 @@ def board(shown: Pictures, name: str) -> np.ndarray:
 
 
 def waiting(text: str) -> np.ndarray:
-    """Draw a board that shows a waiting message."""
+    """Draw a board with a waiting message."""
     canvas = Image.new("RGB", (WIDTH, LINE + WIDTH), DARK)
     draw = ImageDraw.Draw(canvas)
     draw.rectangle([0, LINE, WIDTH, LINE + WIDTH], fill=TILE)

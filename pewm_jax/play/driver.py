@@ -40,17 +40,17 @@ from pewm_jax.play.settings import Start
 from pewm_jax.types import WorldState
 
 MOST_UNDO, MOST_WAITING, MOST_WAY = 4, 32, 64
-"""Largest numbers of edits that can be undone, of waiting requests, and of steps per drag."""
+"""Largest number of edits that can be undone, of queued requests, and of steps per drag."""
 NEWEST = ((Drive, GoTo), (Walls,), (Sampler,), (Begin,))
-"""Groups of requests of which only the newest waits: it replaces an earlier one of its group."""
+"""Groups of requests of which only the newest is kept in the queue."""
 PAUSE_S = 0.1
-"""Seconds for a browser on the same machine to draw before the next step is imagined ahead."""
+"""Seconds given to a browser on the same machine to draw before the next step is imagined ahead."""
 PATIENCE_S = 5.0
-"""Seconds to wait for the thread at the end."""
+"""Seconds to wait for the thread on exit."""
 
 
 class Driver:
-    """Drives in a thread of its own; ``put`` and ``close`` may be called from any thread."""
+    """Drives in its own thread; ``put`` and ``close`` may be called from any thread."""
 
     def __init__(
         self,
@@ -61,14 +61,14 @@ class Driver:
         *,
         ahead: bool = True,
     ):
-        """Begin to load the model.
+        """Start loading the model.
 
         Args:
             load: returns the model; called in the thread, as it may take long.
-            start: where the drive begins.
+            start: the start of the drive.
             show: receives all updates, in the thread.
             folder: folder of saved worlds and videos.
-            ahead: imagine the likely next steps while no requests wait.
+            ahead: whether to imagine likely next steps while the queue is empty.
         """
         self._load, self._show, self._folder = load, show, folder
         self._looks_ahead = ahead
@@ -89,7 +89,7 @@ class Driver:
 
     @property
     def engine(self) -> Engine | None:
-        """Return the model, None while it is loaded."""
+        """Return the model, or None while it is loading."""
         return self._engine
 
     def tell(self, sentence: str) -> None:
@@ -97,10 +97,10 @@ class Driver:
         self._log(sentence, failed=True)
 
     def put(self, request: Request) -> None:
-        """Queue a request; return at once.
+        """Queue a request; return immediately.
 
-        A request replaces an earlier one of its group (``NEWEST``) that still waits. If
-        ``MOST_WAITING`` others wait, the request is dropped and the page shows a message.
+        A request replaces an earlier one of its group (``NEWEST``) that is still queued. If
+        ``MOST_WAITING`` others are queued, the request is dropped and the page shows a message.
         """
         with self._changed:
             group = next((kinds for kinds in NEWEST if isinstance(request, kinds)), ())
@@ -113,11 +113,11 @@ class Driver:
         if dropped:
             self.tell(
                 f"{len(waiting)} requests are waiting: {type(request).__name__} was dropped. Wait "
-                "until the picture changes, then ask again."
+                "until the image changes, then try again."
             )
 
     def close(self) -> None:
-        """End the thread after its present work, and finish a video that is being recorded.
+        """Stop the thread after its present work, and finish a video that is being recorded.
 
         Waits at most ``PATIENCE_S``, because compilations may take longer.
         """
@@ -152,7 +152,7 @@ class Driver:
                 self._changed.wait()
 
     def _asked_within(self, seconds: float) -> bool:
-        """Wait some seconds for a request; return whether one has arrived."""
+        """Wait up to some seconds for a request; return whether one has arrived."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._waiting) or self._ended, seconds)
 
@@ -227,7 +227,7 @@ class Driver:
     def _edit(self, engine: Engine, now: Session, request: Event, asked: float) -> None:
         if isinstance(request, session.Walls):
             self._session = session.apply(engine, now, request)
-            self._made = {}  # the steps imagined ahead may be different now
+            self._made = {}  # the steps imagined ahead may be invalid now
             self._log(self._session.said)
             return
         with self._during("changing the map"):
@@ -335,7 +335,7 @@ class Driver:
         self._log(f"The video is {path.name}.", link=path)
 
     def _during(self, text: str) -> contextlib.AbstractContextManager[None]:
-        """Show what is being done, and for how long."""
+        """Show the present work, and its duration."""
         return ticking(text, lambda said: self._log(said, busy=True))
 
     def _log(self, said: str, **rest) -> None:
@@ -353,10 +353,10 @@ TICK_S = 1.0
 
 @contextlib.contextmanager
 def ticking(text: str, log: Callable[[str], None]) -> Iterator[None]:
-    """Report once a second what is being done and for how long, while the block runs.
+    """Report the present work and its duration once a second, while the block runs.
 
     Args:
-        text: what is being done.
+        text: description of the work.
         log: receives the messages, also from another thread.
     """
     begun, ended = time.monotonic(), threading.Event()

@@ -1,7 +1,7 @@
 """A world model as the few compiled programs that a drive needs, each with one shape.
 
-Every step is one action, imagined as a clip of its own and stored in the memory, as in
-``worlds.imagine``. So one program is compiled, whatever keys are pressed.
+Every step is one action, imagined as its own clip and stored in the memory, as in
+``worlds.imagine``. So only one program is compiled, whatever keys are pressed.
 """
 
 from __future__ import annotations
@@ -38,50 +38,50 @@ class Engine:
 
     @property
     def model(self) -> World:
-        """The settings of the model."""
+        """Return the settings of the model."""
         return self.config.model
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the images, pixels."""
+        """Return height and width of the images, pixels."""
         return self.model.clip.height, self.model.clip.width
 
     @property
     def has_memory(self) -> bool:
-        """Whether the model has a memory."""
+        """Return whether the model has a memory."""
         return self.model.capabilities.memory
 
     @property
     def editable(self) -> bool:
-        """Whether boxes of the map can be erased and moved."""
+        """Return whether boxes of the map can be erased and moved."""
         return self.model.capabilities.edits
 
     @property
     def cell_m(self) -> float:
-        """The size at which points of the map are drawn, metres."""
+        """Return the size at which points of the map are drawn, metres."""
         return float(max(self.model.facts.cell_m[:2], default=0.1))
 
     @property
     def sampler_steps(self) -> int:
-        """Steps of the sampler, 0 if it has none."""
+        """Return the number of sampler steps, 0 without a sampler."""
         return self.model.sample_steps
 
     def with_sampler_steps(self, steps: int) -> Engine:
-        """Return the same model with another number of the sampler's steps.
+        """Return the same model with another number of sampler steps.
 
         Raises:
             ConfigError: the sampler does not support this number.
         """
-        require(self.sampler_steps > 0, f"{self.name} has no sampler whose steps can be set.")
+        require(self.sampler_steps > 0, f"{self.name} has no sampler with a number of steps.")
         model = self.model.with_sample_steps(steps)
         return dataclasses.replace(self, config=dataclasses.replace(self.config, model=model))
 
     def start(self, frames: Frames) -> WorldState:
-        """Begin a world; see ``worlds.start``."""
+        """Start a world; see ``worlds.start``."""
         return worlds.start(self.model, self.params, frames)
 
     def imagine(self, world: WorldState, action_3: np.ndarray, key: Array) -> WorldState:
-        """Return the world after one action (dx, dy, dyaw), with the frame seen then."""
+        """Return the world after one action (dx, dy, dyaw), including the new frame."""
         action = np.asarray(action_3, np.float32)[None]
         return worlds.imagine(self.model, self.params, world, action, key)[0]
 
@@ -122,7 +122,7 @@ class Engine:
 
 
 def open_engine(name: str, config: Config, params: Params) -> Engine:
-    """Return an engine, its parameters on the device.
+    """Return an engine with its parameters on the device.
 
     Raises:
         UserError: the model is not a world that can be driven.
@@ -134,7 +134,7 @@ def open_engine(name: str, config: Config, params: Params) -> Engine:
 
 
 def _require_box(box_23: np.ndarray) -> None:
-    """Refuse an invalid box; compiled programs cannot check it."""
+    """Raise an error for an invalid box; compiled programs cannot check it."""
     box = np.asarray(box_23)
     if box.shape != (2, 3) or not np.isfinite(box).all() or (box[0] >= box[1]).any():
         raise UserError("The box is empty: choose one in the map with a size above 0.")

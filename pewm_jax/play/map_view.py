@@ -19,7 +19,7 @@ DARK, PATH, IMAGINED, BOX, GOAL = (
     (255, 120, 120),
     (140, 255, 170),
 )
-"""Colours of the background, the path, imagined points, the chosen box, and its target."""
+"""Colours of the background, the path, imagined points, the selected box, and its target."""
 HEADROOM_M = 0.35
 """Points this far above the camera count as ceiling, which is hidden by default, metres."""
 FRUSTUM_M, WIDE = 0.3, 1.5
@@ -30,7 +30,7 @@ class MapView:
     """The 3D scene of a page.
 
     Attributes:
-        box_23: (2, 3) the chosen box, metres, or None.
+        box_23: (2, 3) the selected box, metres, or None.
     """
 
     def __init__(self, server: viser.ViserServer):
@@ -106,7 +106,7 @@ class MapView:
                 self._draw_points()
 
     def choose(self, box_23: np.ndarray | None) -> None:
-        """Choose a box; None clears the choice."""
+        """Select a box; None clears the selection."""
         with self._lock, self._server.atomic():
             self.box_23 = box_23
             for node in (self._source, self.target):
@@ -119,7 +119,7 @@ class MapView:
             self.target.wxyz = (1.0, 0.0, 0.0, 0.0)
 
     def moved(self) -> tuple[tuple[float, float, float], float]:
-        """Return how far the box was dragged: metres, and degrees about its vertical axis."""
+        """Return the displacement of the dragged box: metres, and degrees about the vertical."""
         assert self.box_23 is not None
         x, y, z = (float(v) for v in np.asarray(self.target.position) - self.box_23.mean(0))
         return (x, y, z), float(np.degrees(_yaw(self.target.wxyz)))
@@ -166,7 +166,7 @@ class MapView:
         self._path.visible = len(path) > 1
 
     def _look(self, before: Session | None, now: Session) -> None:
-        """Put the browsers' cameras above a new place, and let them follow the agent."""
+        """Move the browsers' cameras to a new place, and make them follow the agent."""
         here = pose(now)[:3, 3]
         if before is None or before.place is not now.place:
             self.look_from_above()

@@ -1,7 +1,7 @@
-"""The page in the browser: pictures, buttons, keys and the map, served by viser.
+"""The page in the browser: images, buttons, keys and the map, served by viser.
 
-Keys are commands with a hotkey. viser's own page moves its 3D camera by the same keys; a listener
-that the page installs (``KEYS``) stops these key events, so that the keys only drive.
+Keys are commands with a hotkey. viser's own page moves its 3D camera with the same keys; a listener
+installed by the page (``KEYS``) stops these key events, so that the keys only drive.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pewm_jax.play.settings import Serve, Start
 from pewm_jax.report.pictures import as_bytes
 
 VIEW_WIDTH, PANEL_WIDTH = 540, 310
-"""Widths of the pictures and of the controls, pixels."""
+"""Widths of the images and of the controls, pixels."""
 SAMPLER = ("1", "2", "4", "8", "16")
 STEPS = {
     "forward": (1, 0, 0),
@@ -83,11 +83,11 @@ class Page:
         name: str,
         log: Callable[[str], None] = lambda _: None,
     ):
-        """Serve the page, and begin to load the model.
+        """Serve the page, and start loading the model.
 
         Args:
             load: returns the model, an ``Engine``.
-            start: where the drive begins.
+            start: the start of the drive.
             serve: address, port and names.
             folder: folder of saved worlds and videos.
             name: name of the model, for the title.
@@ -228,7 +228,7 @@ class Page:
             self._choose(picking.at_click(self._map.points, origin, direction))
 
     def _choose(self, box_23: np.ndarray | None) -> None:
-        """Choose a box and write its numbers into the fields."""
+        """Select a box and write its numbers into the fields."""
         self._map.choose(box_23)
         if box_23 is not None:
             x, y, z = (round(float(v), 2) for v in box_23.mean(0))
@@ -237,7 +237,7 @@ class Page:
             self._size.value = (x, y, z)
 
     def _typed(self, event: Any) -> None:
-        """Choose the box that a user typed; ignore values that the page itself wrote."""
+        """Select the box typed by a user; ignore values written by the page itself."""
         if event.client is not None:
             middle, half = np.array(self._middle.value), np.array(self._size.value) / 2
             self._map.choose(np.stack([middle - half, middle + half]))

@@ -13,11 +13,11 @@ from pewm_jax.play.extra import viser
 from pewm_jax.play.session import PageUpdate, Request
 
 SAY_AGAIN_S = 10.0
-"""Seconds after which the terminal repeats what is being waited for."""
+"""Seconds after which the terminal repeats the message of the present work."""
 
 
 class Terminal:
-    """Prints to the terminal what the page waits for, and its errors."""
+    """Prints the page's present work and its errors to the terminal."""
 
     def __init__(self, log: Callable[[str], None]):
         self._log, self._phase, self._reported = log, "", 0.0

@@ -1,4 +1,4 @@
-"""Choose a box in the map, by a rectangle on the screen or by a click."""
+"""Selection of a box in the map, by a rectangle on the screen or by a click."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 
 FLOOR_M, PAD_M = 0.08, 0.05
-"""Points less than this above the floor count as floor; and the margin of a box, metres."""
+"""Height above the floor below which points count as floor; and the margin of a box, metres."""
 CLICK_M = (0.9, 0.9, 1.1)
 """Size of the box around a click, metres."""
 NEAR_RAY_M = 0.12
 """Largest distance of a clicked point from the ray of the click, metres."""
 FIELDS, BEHIND_M = 12, 0.3
-"""Fields along each side of a rectangle; points farther behind the nearest point of their field are
-hidden, metres."""
+"""Number of cells along each side of a rectangle; points farther behind the nearest point of their
+cell are hidden, metres."""
 EDGE = 2.0
 """Percentage of the points of a rectangle that may lie outside its box, at each end."""
 
@@ -78,7 +78,7 @@ def _in_front(
     low_2: tuple[float, float],
     high_2: tuple[float, float],
 ) -> np.ndarray:
-    """Return (P,) bool: which points of a rectangle are visible, field by field."""
+    """Return (P,) bool: which points of a rectangle are visible, per cell."""
     fields = np.zeros(len(depth_P), int)
     for place, low, high in zip((across_P, down_P), low_2, high_2, strict=True):
         share = (place - low) / max(high - low, 1e-9)

@@ -1,4 +1,4 @@
-"""Where a drive begins: in a house, a mesh, an episode or a recording, fitted to the model."""
+"""Start of a drive: in a house, a mesh, an episode or a recording, fitted to the model."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, Frames
 
 LOOKS, CANDIDATES, OPEN_M, TURN = 12, 16, 3.0, np.pi / 6
-"""Frames of the look around at the start; candidate positions for the start; radius in which free
-space around them is counted, metres; start headings are multiples of this, radians."""
+"""Frames of the initial full turn; candidate start positions; radius in which free space around
+them is counted, metres; start headings are multiples of this angle, radians."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StartPoint:
-    """The frames with which a drive begins, and the scene they show.
+    """The first frames of a drive, and their scene.
 
     Attributes:
         name: name of the scene, for display.
         frames: S ≥ 1 frames of the model's size, rgb uint8; the last one is the present.
         planar_3: x, y, yaw of the present in a house or mesh, else None.
-        simulator: the house or mesh, which gives the ground truth and walls, else None.
+        simulator: the house or mesh, which provides the ground truth and collisions, else None.
     """
 
     name: str
@@ -46,7 +46,7 @@ class StartPoint:
 
 
 def open_place(start: Start, height: int, width: int) -> StartPoint:
-    """Open the scene in which a drive begins.
+    """Open the scene in which a drive starts.
 
     Args:
         start: the settings.
@@ -77,14 +77,14 @@ def open_place(start: Start, height: int, width: int) -> StartPoint:
 
 
 def require_shown(model: World, start: Start) -> None:
-    """Refuse to begin with pictures of something else than a world was trained on.
+    """Raise an error if a drive would start with other images than a world was trained on.
 
     Args:
         model: the world.
-        start: what was asked for.
+        start: the requested start.
 
     Raises:
-        UserError: the world knows pictures of blocks, and the drive begins with surfaces.
+        UserError: the world was trained on images of blocks, but the drive starts with surfaces.
     """
     memory: Any = getattr(model, "memory", None)
     if not getattr(memory, "CLASSES", False):
@@ -93,8 +93,10 @@ def require_shown(model: World, start: Start) -> None:
         require_same_cells(model, EpisodeSource(Path(start.episode))[start.number])
     elif memory.pictures == "cells":
         raise UserError(
-            "This world knows pictures of blocks, and generated houses, meshes and recordings show "
-            "surfaces: begin with an episode of its data, such as --episode data/persist/revisit."
+            "This world was trained on images of blocks, but generated houses, meshes and "
+            "recordings "
+            "show surfaces: start with an episode of its data, such as --episode "
+            "data/persist/revisit."
         )
 
 
@@ -139,7 +141,7 @@ def action_between(before_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
 
 
 def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: float) -> np.ndarray:
-    """Return (n, 3) equal actions from one planar pose to another, none larger than a step.
+    """Return (n, 3) equal actions from one planar pose to another, at most one step each.
 
     Args:
         before_3: x, y, yaw.
@@ -157,7 +159,7 @@ def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: floa
 
 
 def fitted(frames: Frames, height: int, width: int) -> Frames:
-    """Crop frames around their middle to an aspect ratio, and resize them and their intrinsics.
+    """Centre-crop frames to an aspect ratio, and resize them and their intrinsics.
 
     Args:
         frames: NumPy frames, rgb uint8.
@@ -211,7 +213,7 @@ def _recording(start: Start, height: int, width: int) -> StartPoint:
 
 
 def _beginning(grid: NavGrid, rng: np.random.Generator) -> np.ndarray:
-    """Return x, y, yaw: of some free positions the one with most free space, facing that space."""
+    """Return the pose x, y, yaw with the most free space among candidates, facing that space."""
     free = grid.centre_of(np.argwhere(grid.free_YX))
     places = sample_free(grid, rng, CANDIDATES)
     around = [free[np.linalg.norm(free - place, axis=-1) < OPEN_M] - place for place in places]

@@ -63,7 +63,7 @@ def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldStat
 
     Args:
         engine: the model to drive it with.
-        like: a world of that model, for its shapes.
+        like: a world of that model, which defines the shapes.
         folder: the folder.
         name: its name.
 
@@ -99,10 +99,10 @@ FPS = 6
 
 
 class DriveFilm:
-    """A video that is being recorded; the next free number is its name."""
+    """A video that is being recorded; its name is the next free number."""
 
     def __init__(self, folder: Path, picture_HWC: np.ndarray):
-        """Begin a video.
+        """Start a video.
 
         Args:
             folder: the folder of the video; it is created if necessary.

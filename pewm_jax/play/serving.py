@@ -1,9 +1,9 @@
-"""Serve the page: its address, the browser, and the protection against other sites.
+"""Serve the page: its address, the browser, and protection against other sites.
 
-A browser lets any page open a websocket to any address, including this machine's, and tells the
-server only which page asks (``Origin``) and by which name the server was addressed (``Host``). A
-page of another site has another origin. A page whose own name was made to point at this machine
-("DNS rebinding") has the same origin, but an unknown host name. See RFC 6455, section 10.2.
+A browser lets any page open a websocket to any address, including this machine's, and only tells
+the server which page asks (``Origin``) and by which name the server was addressed (``Host``). A
+page of another site has another origin. A page whose own name was redirected to this machine ("DNS
+rebinding") has the same origin, but an unknown host name. See RFC 6455, section 10.2.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pewm_jax.play.settings import LOOPBACK, Serve
 
 
 def open_in_browser(url: str) -> bool:
-    """Open a page in the browser if there is a desktop; return whether that was tried."""
+    """Open a page in the browser if there is a desktop; return whether this was attempted."""
     desktop = sys.platform == "darwin" or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
     return desktop and webbrowser.open(url)
 
@@ -54,11 +54,11 @@ def here(host: str) -> str:
 
 
 def server(serve: Serve, log: Callable[[str], None] = lambda _: None) -> viser.ViserServer:
-    """Start the server, without viser's own message; refuse pages of other sites.
+    """Start the server, without viser's own message; reject pages of other sites.
 
     Args:
         serve: address, port and names.
-        log: receives the reasons of refusals.
+        log: receives the reasons for rejections.
 
     Raises:
         ConfigError: the host is not an address of this machine; viser would wait for it forever.
@@ -79,7 +79,7 @@ def server(serve: Serve, log: Callable[[str], None] = lambda _: None) -> viser.V
         if not servers:
             begun.stop()
             raise UserError(
-                f"viser {viser.__version__} does not let the viewer refuse pages of other sites: "
+                f"viser {viser.__version__} does not support rejecting pages of other sites: "
                 "pip install 'viser==1.1.1'."
             )
     return begun
@@ -90,11 +90,14 @@ PORTS = {"http": 80, "https": 443}
 PLAIN = re.compile(r"[a-z0-9._:-]{1,253}")
 """Host names that are safe to print; other text that a client sends must not reach the terminal."""
 MOST_REPORTED = 20
-"""Largest number of refusals printed: a page that tries many names must not fill the terminal."""
+"""Largest number of rejections printed: a page that tries many names must not flood the
+terminal."""
 
 
-def objection(origin: str | None, host: str | None, here: str, names: Sequence[str] = ()) -> str:
-    """Return why a request is refused, in one sentence; empty if it is allowed.
+def rejection_reason(
+    origin: str | None, host: str | None, here: str, names: Sequence[str] = ()
+) -> str:
+    """Return the reason why a request is rejected, as a sentence; empty if it is allowed.
 
     Args:
         origin: its header ``Origin``; None if the request does not come from a browser's page.
@@ -110,11 +113,11 @@ def objection(origin: str | None, host: str | None, here: str, names: Sequence[s
     name = called.hostname
     if not (name in known or _in_digits(name)):
         return f"{name!r} is not a known name of this page: --names {name} allows it."
-    return "" if origin is None else _objection_to_page(origin, called, names)
+    return "" if origin is None else _page_rejection_reason(origin, called, names)
 
 
-def _objection_to_page(origin: str, called: SplitResult, names: Sequence[str]) -> str:
-    """Return why a page may not drive a server addressed by a known name; empty if it may."""
+def _page_rejection_reason(origin: str, called: SplitResult, names: Sequence[str]) -> str:
+    """Return why a page may not use a server addressed by a known name; empty if it may."""
     asking = _parts(origin)
     if asking is None or asking.scheme not in PORTS:
         return f"A page without its own address ({origin!r}) may not drive here."
@@ -132,14 +135,14 @@ def _objection_to_page(origin: str, called: SplitResult, names: Sequence[str]) -
 def refuse_other_sites(
     here: str, names: Sequence[str], log: Callable[[str], None]
 ) -> Iterator[list[Any]]:
-    """Let websocket servers that start inside the block check requests and refuse with 403.
+    """Make websocket servers started inside the block check requests and reject with 403.
 
-    viser starts its server by itself and has no hook for such a check, so the function that starts
+    viser starts its server internally and has no hook for such a check, so the function that starts
     it is replaced inside the block.
 
     Args:
         here: the host served on.
-        names: further allowed names, as for ``objection``.
+        names: further allowed names, as for ``rejection_reason``.
         log: receives each reason once.
 
     Yields:
@@ -152,9 +155,9 @@ def refuse_other_sites(
         def process(connection: Any, request: Request) -> Any:
             headers = request.headers
             try:
-                reason = objection(headers.get("Origin"), headers.get("Host"), here, names)
+                reason = rejection_reason(headers.get("Origin"), headers.get("Host"), here, names)
             except LookupError:  # a repeated header
-                reason = "A request with two hosts or two origins is refused."
+                reason = "A request with two hosts or two origins is rejected."
             if not reason:
                 return None if process_request is None else process_request(connection, request)
             if reason not in reported and len(reported) < MOST_REPORTED:

@@ -1,9 +1,9 @@
 """The state of a drive and its events; pure functions, without server, threads or files.
 
-A step is ``engine.imagine`` of one action with a key made of the drive's seed and the number of the
-step, so a drive is a function of its events. A step imagined ahead (``ahead``) is bit-identical to
-the same step imagined on request. Requests that need more than the state (saving, recording, …) and
-the updates of the page are defined here as well.
+A step is ``engine.imagine`` of one action with a key derived from the drive's seed and the step
+number, so a drive is a function of its events. A step imagined ahead (``ahead``) is bit-identical
+to the same step imagined on request. Requests that need more than the state (saving, recording, …)
+and the updates of the page are defined here as well.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pewm_jax.types import Array, WorldState
 MOST_PATH = 4096
 """Largest number of positions of the path."""
 STILL = np.zeros(3, np.float32)
-"""The action that stays in place: the present frame is imagined again."""
+"""The null action: the present frame is imagined again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Move:
         box: its lower and upper corner, metres.
         shift: metres along x, y, z.
         turn_deg: degrees counter-clockwise, seen from above, about the middle of the box.
-        leave: keep the original, which makes a copy.
+        leave: whether to keep the original, which makes a copy.
     """
 
     box: tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -106,7 +106,7 @@ class Session:
 
 
 def begin(engine: Engine, place: StartPoint, seed: int = 0) -> Session:
-    """Begin a drive with the observed frames of a start point."""
+    """Start a drive with the observed frames of a start point."""
     world = engine.start(place.frames)
     said = f"This is {place.name} as observed; every step from here is imagined."
     return dataclasses.replace(_begun(place, world, seed, said), observed=True)
@@ -131,7 +131,7 @@ def wanted(session: Session, event: Drive) -> tuple[np.ndarray, np.ndarray, bool
 
 
 def ahead(engine: Engine, session: Session, action_3: np.ndarray) -> WorldState:
-    """Return the world after one action; ``apply`` takes it as ``made``."""
+    """Return the world after one action, for the argument ``made`` of ``apply``."""
     return engine.imagine(session.world, action_3, key_of(session))
 
 
@@ -158,7 +158,7 @@ def apply(
 
 
 def catch_up(engine: Engine, session: Session) -> Session:
-    """Return the drive after its step without memory was imagined as well."""
+    """Return the drive after also imagining its step without memory."""
     if session.due is None:
         return session
     action, key = session.due
@@ -251,7 +251,7 @@ def key_of(session: Session) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Begin:
-    """Request: begin a drive elsewhere."""
+    """Request: start another drive."""
 
     start: Start
 
@@ -265,7 +265,7 @@ class GoTo:
 
 @dataclasses.dataclass(frozen=True)
 class Sampler:
-    """Request: set the number of the sampler's steps."""
+    """Request: set the number of sampler steps."""
 
     steps: int
 
@@ -286,7 +286,7 @@ class Load:
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """Request: begin or end a video."""
+    """Request: start or end a video."""
 
     on: bool
 
@@ -310,7 +310,7 @@ class PageUpdate:
         picture: the board, uint8 (H, W, 3).
         session: the drive, for the map.
         engine: the model that imagines it.
-        seconds: duration of the last step, from the key to the picture; None if there was none.
+        seconds: duration of the last step, from the key press to the image; None if there was none.
         recording: whether a video is being recorded.
         worlds: names of the saved worlds.
         link: a file that was written.

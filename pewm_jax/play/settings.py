@@ -15,11 +15,11 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """Where the drive begins: in a generated house unless another source is given."""
+    """Start of the drive: a generated house unless another source is given."""
 
     house: int = 2
-    """Seed of the generated house. The model shipped with the library was trained on 0, 3, 6, … and
-    not on 2, 5, 8, …"""
+    """Seed of the generated house. The shipped model was trained on 0, 3, 6, … and not on 2, 5, 8,
+    …"""
     seed: int = 0
     """Seed of the start position and of the sampler's noise."""
     scene: str = ""
@@ -27,11 +27,12 @@ class Start:
     up: Literal["auto", "y", "z"] = "auto"
     """Which axis of the mesh points up; `auto`: y for GLB and glTF, z for the others."""
     episode: str = ""
-    """A split's folder, such as data/small/revisit: begin with one of its episodes."""
+    """A split's folder, such as data/small/revisit: start with one of its episodes."""
     number: int = 0
     """Number of the episode."""
     recording: str = ""
-    """A folder of colour images, depth images and a trajectory, as `pewm-jax data import` reads."""
+    """A folder of colour images, depth images and a trajectory, in the format of `pewm-jax data
+    import`."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy in pixels of the recorded images; a recording needs them."""
     depth_scale: float = 1000.0
@@ -50,14 +51,14 @@ class Start:
         named = [name for name in ("scene", "episode", "recording") if getattr(self, name)]
         require(
             len(named) < 2,
-            f"--{' and --'.join(named)} are given: a drive begins in one place; keep only one of "
+            f"--{' and --'.join(named)} are given: a drive starts in one place; keep only one of "
             "them.",
         )
         for name in ("house", "seed", "number"):
             value = getattr(self, name)
             require(
                 isinstance(value, int) and value >= 0,
-                f"--{name} is {value!r}: use a whole number from 0 on.",
+                f"--{name} is {value!r}: use an integer of 0 or more.",
             )
         require(self.frames >= 1, f"--frames is {self.frames}: use at least 1.")
         require(
@@ -78,18 +79,18 @@ class Serve:
     host: str = "127.0.0.1"
     """Address to serve on. With 0.0.0.0 other machines can reach the page, without a password."""
     port: int = 8080
-    """Port of the page; the next free one is taken if it is in use."""
+    """Port of the page; if it is in use, the next free one."""
     names: tuple[str, ...] = ()
     """Further names of the page in the browser's address bar, such as that of a proxy. Pages of
-    other sites are refused."""
+    other sites are rejected."""
     worlds: Path | None = None
     """Folder of saved worlds and videos; by default worlds/ beside the run's reports."""
     ahead: bool = True
-    """Imagine likely next steps while no key is pressed, so that they appear at once."""
+    """Imagine likely next steps while no key is pressed, so that they appear immediately."""
     open: bool = True
     """Open the page in the browser if there is a desktop."""
 
     def __post_init__(self):
         """Validate."""
         require(0 <= self.port < 65536, f"--port is {self.port}: use 0 to 65535.")
-        require(bool(self.host), "--host is empty: name an address, such as 127.0.0.1.")
+        require(bool(self.host), "--host is empty: use an address, such as 127.0.0.1.")

@@ -1,7 +1,7 @@
 """Charts as PNG files, drawn by matplotlib without its global state.
 
-Equal values give equal bytes. Every chart has a light and a dark form; the light one stands on
-white, the dark one is for pages in a dark colour scheme.
+Equal values give equal bytes. Every chart has a light and a dark version; the light one has a white
+background, the dark one is for pages in a dark colour scheme.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ METHOD_COLOURS = {
     "copy": "#8a8f98",
     "truth": "#8a8f98",
 }
-"""The colour of each method, distinguishable for the colour-blind. The evaluated model has one
-colour, with a memory or without."""
+"""The colour of each method, distinguishable for colour-blind readers. The evaluated model has the
+same colour with and without a memory."""
 DOTS_PER_INCH = 200
 BAND_OPACITY = 0.16
 MARKED = 16
-"""Curves of at most so many points have a mark at each."""
+"""Largest number of points for which a curve has markers."""
 LABEL_GAP = 0.045
-"""Least distance between the names of two curves, as a share of the height."""
+"""Smallest distance between the labels of two curves, as a fraction of the height."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,16 +51,16 @@ DARK = _Theme("#e8eaee", "#9aa2b1", "#15181d", "#333944")
 
 
 class Chart(Protocol):
-    """What a page shows of a chart."""
+    """A chart on a page."""
 
     @property
     def title(self) -> str:
-        """What is drawn."""
+        """Return the title."""
         ...
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to draw."""
+        """Return whether there is nothing to draw."""
         ...
 
     def png(self, *, dark: bool = False) -> bytes:
@@ -73,8 +73,8 @@ class Line:
     """A curve with a band around it.
 
     Attributes:
-        name: for the label at its end.
-        colour: any that matplotlib knows.
+        name: label at its end.
+        colour: any matplotlib colour.
         values: one per position, None if missing.
         low: the lower edge of the band, None where there is none; empty for no band.
         high: its upper edge.
@@ -90,7 +90,7 @@ class Line:
     def with_errors(
         cls, name: str, colour: str, values: Sequence[float | None], errors: Sequence[float | None]
     ) -> Line:
-        """Return a curve whose band is as wide as the errors on both sides."""
+        """Return a curve with the band value ± error."""
         pairs = list(zip(values, errors, strict=True))
         low = [None if v is None else v - (e or 0) for v, e in pairs]
         high = [None if v is None else v + (e or 0) for v, e in pairs]
@@ -102,12 +102,12 @@ class LineChart:
     """Curves over positions.
 
     Attributes:
-        title: what is drawn.
-        x_label: of the horizontal axis.
-        lines: the curves, with as many values as there are positions.
+        title: the title.
+        x_label: label of the horizontal axis.
+        lines: the curves, with one value per position.
         x: the positions; 1, 2, 3, … by default.
-        unit: of the values, shown in the title.
-        label_lines: whether each curve's name stands at its end.
+        unit: unit of the values, shown in the title.
+        label_lines: whether each curve is labelled at its end.
         size: width and height, inches.
     """
 
@@ -121,7 +121,7 @@ class LineChart:
 
     @property
     def is_empty(self) -> bool:
-        """Whether no curve has a value."""
+        """Return whether no curve has a value."""
         return all(value is None for line in self.lines for value in line.values)
 
     def png(self, *, dark: bool = False) -> bytes:
@@ -165,7 +165,7 @@ class LineChart:
 
 @dataclasses.dataclass(frozen=True)
 class IntervalRow:
-    """A mean with its interval, and single values beside it."""
+    """A mean with its interval, and the single values."""
 
     label: str
     mean: float
@@ -177,12 +177,12 @@ class IntervalRow:
 
 @dataclasses.dataclass(frozen=True)
 class IntervalChart:
-    """Means with their intervals, one below the other.
+    """Means with their intervals, stacked vertically.
 
     Attributes:
-        title: what is drawn.
+        title: the title.
         caption: a line below the title.
-        rows: from top to bottom.
+        rows: the rows, from top to bottom.
     """
 
     title: str
@@ -191,7 +191,7 @@ class IntervalChart:
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is no row."""
+        """Return whether there are no rows."""
         return not self.rows
 
     def png(self, *, dark: bool = False) -> bytes:
@@ -254,14 +254,14 @@ def _numbers(values: Sequence[float | None]) -> list[float]:
 
 
 def _band(line: Line) -> tuple[list[float], list[float]]:
-    """Return the edges of a band; as high as the curve where there is no interval."""
+    """Return the edges of a band; equal to the curve where there is no interval."""
     edges = zip(line.values, line.low, line.high, strict=True)
     pairs = [(v, v) if low is None or high is None else (low, high) for v, low, high in edges]
     return _numbers([pair[0] for pair in pairs]), _numbers([pair[1] for pair in pairs])
 
 
 def _label_lines(axes: Axes, lines: Sequence[Line], x: Sequence[float]) -> None:
-    """Write each curve's name at its end, and none over another."""
+    """Label each curve at its end, without overlap."""
     bottom, top = axes.get_ylim()
     ends = [
         (known[-1], line)

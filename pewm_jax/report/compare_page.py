@@ -27,8 +27,8 @@ from pewm_jax.report.table import Cell, Row, Table, row, with_interval
 from pewm_jax.report.table import heading as heading_row
 
 INTRODUCTION = (
-    "Two models, scored by one protocol: the same clips of the same houses, the same context, "
-    "motion and noise. Differences are taken clip by clip."
+    "Two models, evaluated with one protocol: the same clips of the same houses, the same context, "
+    "motion and noise. Differences are paired by clip."
 )
 COLOURS = {"a": "#1f6feb", "b": "#e8731a", "differences": "#1a9a6c"}
 NAMES = {"a": "a", "b": "b", "differences": "a − b"}
@@ -39,7 +39,7 @@ NOT_COMPARED = (
 
 
 def side_by_side(long_horizon: int, one: Path, two: Path) -> list[np.ndarray]:
-    """Draw the long rollouts that both reports show: the truth, the first run, the second.
+    """Draw the long rollouts shown in both reports: ground truth, first run, second run.
 
     Args:
         long_horizon: imagined frames of a long rollout.
@@ -47,7 +47,7 @@ def side_by_side(long_horizon: int, one: Path, two: Path) -> list[np.ndarray]:
         two: folder of the second one's.
 
     Returns:
-        A picture for each rollout of which both have the frames.
+        An image for each rollout whose frames both reports have.
     """
     steps = picture_steps(long_horizon)
     names = ["observed" if step == 0 else f"step {step}" for step in steps]
@@ -70,7 +70,7 @@ def side_by_side(long_horizon: int, one: Path, two: Path) -> list[np.ndarray]:
 
 
 def _own(report: Path, index: int) -> Path:
-    """Return the file with the frames of the evaluated model, with a map or without a memory."""
+    """Return the file with the frames of the evaluated model, with or without a memory."""
     files = [report / ROWS / f"{index:02d}-{method}.png" for method in OWN_METHODS]
     return next((file for file in files if file.is_file()), files[0])
 
@@ -79,7 +79,7 @@ def sentences(content: Mapping[str, Any]) -> list[str]:
     """Return the sentences of the comparison, for the page and the terminal.
 
     Args:
-        content: of ``comparison.json``.
+        content: content of ``comparison.json``.
     """
     a, b = (content[side]["name"] for side in ("a", "b"))
     return [
@@ -91,13 +91,13 @@ def sentences(content: Mapping[str, Any]) -> list[str]:
 
 
 def _same_weights(content: Mapping[str, Any]) -> list[str]:
-    """Return a sentence if both sides have the same weights."""
+    """Return a sentence if both runs have the same weights."""
     hashes = [{run["weights_sha256"] for run in content[side]["runs"]} for side in ("a", "b")]
     return ["a and b are the same weights."] if hashes[0] == hashes[1] else []
 
 
 def _samplers(content: Mapping[str, Any]) -> list[str]:
-    """Return how each side samples, if that differs."""
+    """Return the samplers of both runs, if they differ."""
     steps, said = [], []
     for side in ("a", "b"):
         ways = [(run["sampling_steps"], run["sampler"]) for run in content[side]["runs"]]
@@ -109,7 +109,7 @@ def _samplers(content: Mapping[str, Any]) -> list[str]:
 
 
 def outcome(entries: Mapping[str, Any], one: str, two: str) -> str:
-    """Return the end of a sentence on whether the first run's PSNR is above the second's.
+    """Return the second part of a sentence that says whether the first run's PSNR is higher.
 
     Args:
         entries: ``[metric]`` of first − second.
@@ -136,8 +136,8 @@ def comparison_page(content: Mapping[str, Any], pictures: Sequence[np.ndarray]) 
     """Return the page as HTML.
 
     Args:
-        content: of ``comparison.json``.
-        pictures: of ``side_by_side``.
+        content: content of ``comparison.json``.
+        pictures: images of ``side_by_side``.
     """
     first, *others = sentences(content)
     title = "\n".join(f"{side}: {content[side]['name']}" for side in ("a", "b"))
@@ -157,7 +157,8 @@ def _stills(pictures: Sequence[np.ndarray]) -> Section:
     if not pictures:
         return Section("", [Text("The two reports have no frames in common to show.", "quiet")])
     text = (
-        "Long rollouts, the first of the protocol and not chosen: the truth, then each model (with "
+        "Long rollouts, the first of the protocol (not selected): ground truth, then each model "
+        "(with "
         "its map, if it has one), which continues from its own last frame."
     )
     figures = [Figure(png(picture), alt="truth, a, b") for picture in pictures]
@@ -175,11 +176,11 @@ def _scores(content: Mapping[str, Any]) -> Section:
             rows.append(row(label, *cells, str(entries["psnr"]["houses"]), highlight=gain))
     heads = ["", *(heading(name, content) for name in measured), "houses"]
     left = "".join(
-        f" {METRIC_NAMES[name][0]} is left out: the two were measured with different networks."
+        f" {METRIC_NAMES[name][0]} is omitted: the two were measured with different networks."
         for name in content["left_out"]
     )
     left += "".join(
-        f" {METRIC_NAMES[name][0]} is left out: only one of the two was measured with it."
+        f" {METRIC_NAMES[name][0]} is omitted: only one of the two was measured with it."
         for name in content["measured_by_one"]
         if name in METRIC_NAMES
     )
@@ -197,7 +198,7 @@ def _seeds(content: Mapping[str, Any]) -> Section:
     if max(map(len, trained.values())) < 2:
         note = (
             "Each model was trained once, so the effect of the training seed is not measured "
-            "(name more seeds by `--also_a` and `--also_b`)."
+            "(add more seeds with `--also_a` and `--also_b`)."
         )
         return Section("", [Text(note, "quiet")])
     rows: list[Row] = []
@@ -213,8 +214,9 @@ def _seeds(content: Mapping[str, Any]) -> Section:
         found = content["training_seeds"]["differences"][mask]["psnr"]
         rows.append(row("a − b", "", with_interval(found, 2, sign=True), highlight=True))
     note = (
-        "In brackets Student's 95 % interval over training seeds: what another training would give "
-        "in these houses. It does not cover other houses, and the interval over houses does not "
+        "In brackets Student's 95 % interval over training seeds: the variation between trainings, "
+        "in "
+        "these houses. It does not cover other houses, and the interval over houses does not "
         "cover other trainings."
     )
     table = Table(["PSNR, dB", "seed: mean over houses", "over seeds"], rows)

@@ -42,7 +42,7 @@ HOWS = {
     "memory": "with its 3D map, and with the same weights and an empty map",
     "model": "it has no memory and sees only the last picture",
 }
-"""How the model imagines, by its own row."""
+"""How the model imagines, by the key of its own row."""
 TITLES = {
     "memory": "Does the model remember what it saw?",
     "model": "What does a model without a memory imagine?",
@@ -58,22 +58,22 @@ SHOWN = {
     "memory": "the model with its map, the same model with an empty map",
     "model": "the model, which has no memory",
 }
-"""The model's columns in videos, by its own row."""
+"""The model's columns in videos, by the key of its own row."""
 CLUSTERS = {
     "scene": "clustered by scene, because clips of one scene show the same rooms",
     "episode": "clustered by episode: all clips are of one scene, so the error does not cover how "
     "much other scenes differ",
 }
-"""What a standard error covers, for each value of ``clustered_by`` in the protocol."""
+"""Clustering of a standard error, for each value of ``clustered_by`` in the protocol."""
 MINUS = {"memory": "map", "model": "the model"}
-"""What others are subtracted from in the tables, by the model's own row."""
+"""The minuend of differences in the tables, by the key of the model's own row."""
 QUARTERS = ("first quarter", "second", "third", "last")
 PAIR_NAMES = {
     "again": "second visit against the first",
     "out": "first visit against the truth",
     "back": "second visit against the truth",
 }
-"""What the mirror test compares."""
+"""The comparisons of the mirror test."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,16 +82,16 @@ class Gallery:
 
     Attributes:
         videos: (caption, MP4) of each long rollout.
-        strip: frames of one rollout in rows: truth, with its map, empty map, reprojected; of a
-            model without a memory one row instead of two.
+        strip: frames of one rollout in rows: ground truth, with its map, empty map, reprojected;
+            for a model without a memory one row instead of two.
         strip_note: which rollout and which frames they are.
         moving: all frames of that rollout side by side, a GIF.
-        masks: the same true frames with never-seen pixels greyed out.
+        masks: the same ground-truth frames with never-seen pixels greyed out.
         masks_note: what counts as seen before.
         above: the map from above, before and after that rollout; None without a memory.
-        above_note: what is left out of it.
+        above_note: what is omitted in it.
         rows: for each rollout shown, the frames of ``truth`` and of each method at the steps of
-            ``strip``, side by side in one picture and at full size.
+            ``strip``, side by side in one image and at full size.
     """
 
     videos: list[tuple[str, bytes]]
@@ -137,7 +137,7 @@ def evaluation_page(metrics: Mapping[str, Any], gallery: Gallery) -> str:
 
 
 def introduction(protocol: Mapping[str, Any]) -> str:
-    """Return a paragraph: what was done, and whether the places were new to the model."""
+    """Return an introduction: the task, and whether the places were in the training data."""
     places = PLACES[protocol["held_out"]].format(
         shared=len(protocol["trained_scenes"]), scenes=len(protocol["scene_names"])
     )
@@ -147,11 +147,11 @@ def introduction(protocol: Mapping[str, Any]) -> str:
 def _rollouts(gallery: Gallery) -> Section:
     shown = SHOWN["model" if gallery.above is None else "memory"]
     text = (
-        f"From left to right: the recording, {shown}, and the reprojection of what was observed, "
+        f"From left to right: the recording, {shown}, and the reprojection of observed pixels, "
         "without a network. Colour above, depth below (bright is near). All start from the same "
-        "observed picture and follow the same actions. After each clip the model continues from "
-        "its own last frame; the reprojection only shows what was observed. These are the first "
-        "episodes of the split, not chosen."
+        "observed frame and follow the same actions. After each clip the model continues from "
+        "its own last frame; the reprojection only shows observed pixels. These are the first "
+        "episodes of the split, not selected."
     )
     films = [Figure(film, "video/mp4", caption=caption) for caption, film in gallery.videos]
     stills = [
@@ -236,7 +236,7 @@ def _whole_and_frames(
     *,
     sign: bool = False,
 ) -> list[Cell]:
-    """Return the cells of a number and of its values at some frames."""
+    """Return the cells of a mean and of its values at some frames."""
     at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
     return [with_interval(entry, digits, sign=sign) for entry in (whole, *at)]
 
@@ -261,10 +261,11 @@ def steering(metrics: Mapping[str, Any]) -> Section | None:
     heads = ["PSNR, dB", "all frames", *(f"frame {t + 1}" for t in ends)]
     note = (
         f"{found['clips']} walks with the same noise: {100 * found['forward']:.0f} % of their "
-        "steps go forward. Another clip's actions are of a clip in another house; they differ in "
+        "steps go forward. Another clip's actions are those of a clip in another house; they "
+        "differ in "
         f"{100 * found['different']:.0f} % of the steps. Means over houses, in brackets the "
-        "interval of a bootstrap over them. A world that follows its actions is nearest to the "
-        "truth with the true ones."
+        "interval of a bootstrap over them. A world that follows its actions is closest to the "
+        "ground truth with the true ones."
     )
     blocks = [TableBlock(Table(heads, rows)), Text(note, "quiet")]
     return Section("Do the actions steer the model?", blocks)
@@ -300,7 +301,7 @@ def structure(metrics: Mapping[str, Any]) -> Section | None:
 
 
 def videos(metrics: Mapping[str, Any]) -> Section:
-    """Return FVD and KVD with their floors, or why they were not measured."""
+    """Return FVD and KVD with their floors, or the reason why they were not measured."""
     found = metrics["videos"]
     if not found:
         return Section("", [Text(metrics["protocol"]["fvd"], "quiet")])
@@ -411,7 +412,7 @@ def growth(metrics: Mapping[str, Any]) -> Section | None:
 
 
 def mirror(metrics: Mapping[str, Any]) -> Section:
-    """Return the mirror test, or why it was left out."""
+    """Return the mirror test, or the reason why it was skipped."""
     found = metrics["mirror"]
     if not found:
         return Section("", [Text(metrics["protocol"]["mirror"], "quiet")])
@@ -437,15 +438,15 @@ def mirror(metrics: Mapping[str, Any]) -> Section:
     ]
     heads = ["way back against way out", *(METHOD_NAMES[m] for m in methods), "ceiling", "floor"]
     text = (
-        f"The agent goes {found['out']} frames along the recorded way and comes back the same way, "
-        "so it visits each place twice; the model imagines all of it."
+        f"The agent goes {found['out']} frames along the recorded path and returns the same way, "
+        "so it visits each place twice; the model imagines all frames."
     )
     note = (
         f"{found['rollouts']} rollouts. Mean over houses, in brackets the 95 % interval of a "
         "bootstrap over them. The ceiling is the recording, reversed at its end; the floor "
-        "compares the way out with another rollout's way back. Consistency does not imply truth: "
-        "a model that always shows one picture is perfectly consistent, so both visits are also "
-        f"compared with the truth. {metrics['protocol']['src']}"
+        "compares the way out with another rollout's return path. Consistency does not imply "
+        "correctness: a model that always shows one image is perfectly consistent, so both visits "
+        f"are also compared with the ground truth. {metrics['protocol']['src']}"
     )
     blocks = [
         Text(text),
@@ -463,7 +464,7 @@ def _interval_line(method: str, entry: Mapping[str, Any]) -> Line:
 
 
 def coverage(metrics: Mapping[str, Any]) -> Section | None:
-    """Return which share of the pixels seen before the model's map covers; None if unknown."""
+    """Return the share of the pixels seen before that the map covers; None if unknown."""
     shares = metrics["coverage"]
     if not shares:
         return None

@@ -1,4 +1,4 @@
-"""The report of long rollouts: numbers as JSON, a page, a strip of pictures and a video."""
+"""The report of long rollouts: metrics as JSON, a page, a strip of images and a video."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pewm_jax.report.table import Cell, Table
 from pewm_jax.report.video import encode_h264, small_frames
 
 SHOWN = 8
-"""Frames of a walk in the strip."""
+"""Number of frames of a walk in the strip."""
 FRAMES_PER_SECOND = 12
 NAMES = {
     "truth": "truth",
@@ -25,19 +25,20 @@ NAMES = {
     "world": "the world itself",
     "without": "without its voxels",
 }
-"""Names of the methods; other worlds have the names of their runs."""
+"""Labels of the methods; other worlds are labelled with their run's name."""
 
 
 def write(
     folder: Path, facts: Mapping[str, Any], videos: Mapping[str, np.ndarray], ends: Sequence[int]
 ) -> Path:
-    """Write the report; returns the page's path.
+    """Write the report and return the page's path.
 
     Args:
-        folder: where.
-        facts: plain values: ``psnr`` and perhaps ``distances`` by method, ``edits``, ``protocol``.
+        folder: output folder.
+        facts: plain values: ``psnr`` and optionally ``distances`` by method, ``edits``,
+            ``protocol``.
         videos: method → (B, T, H, W, 3) uint8 colours, ``truth`` first.
-        ends: of the stretches, frames.
+        ends: last frames of the segments.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(folder / "horizon.json") as partial:
@@ -57,7 +58,7 @@ def write(
 
 
 def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
-    """Return the lines for the terminal: one for each method."""
+    """Return the lines for the terminal: one per method."""
     said = [f"PSNR in dB of frames {', '.join(_spans(ends))}:"]
     for name, values in facts["psnr"].items():
         said.append(f"  {_name(name):<26}" + "  ".join(f"{value:6.2f}" for value in values))
@@ -72,7 +73,7 @@ def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
 
 
 def sentences(facts: Mapping[str, Any]) -> list[str]:
-    """Return sentences about a world of voxels: its autoencoder, and blocks placed in it."""
+    """Return sentences about a voxel world: its autoencoder, and blocks placed in it."""
     said = []
     if "autoencoder" in facts:
         back = facts["autoencoder"]
@@ -84,18 +85,19 @@ def sentences(facts: Mapping[str, Any]) -> list[str]:
     if "edits" in facts:
         edits = facts["edits"]
         said.append(
-            f"Blocks that were placed and stayed: {edits['stayed']} of {edits['trials']} "
+            f"Placed blocks that persisted: {edits['stayed']} of {edits['trials']} "
             f"({100 * edits['share_of_cells']:.0f} % of their cells; {edits['without_room']} more "
             f"walks had no room); in {edits['frames_in_window']} of {edits['frames']} frames a "
             "part was in the window that may change, where a known cell changes if another class "
-            f"is likelier by {edits['hold']:g} nats. Seen as changed in "
-            f"{edits['changed_in_sight']} of {edits['frames_in_sight']} frames in sight."
+            f"is likelier by {edits['hold']:g} nats. The image changed at the block in "
+            f"{edits['changed_in_sight']} of {edits['frames_in_sight']} frames in which it was "
+            "visible."
         )
     return said
 
 
 def _spans(ends: Sequence[int]) -> list[str]:
-    """Return the names of the stretches between ends, such as 1–200 and 201–400."""
+    """Return the names of the segments between ends, such as 1–200 and 201–400."""
     return [f"{low + 1}–{high}" for low, high in zip((0, *ends[:-1]), ends, strict=True)]
 
 
@@ -139,6 +141,6 @@ def _page(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
     protocol = [(str(name), str(value)) for name, value in facts["protocol"].items()]
     sections.append(Section("How it was measured", [Facts(protocol)]))
     opening = (
-        "Each walk begins with a few observed frames and continues by its recorded actions alone."
+        "Each walk starts with a few observed frames and continues with the recorded actions only."
     )
     return render("Long horizons", [Text(opening, "lead")], sections)

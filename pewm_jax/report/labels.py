@@ -1,4 +1,4 @@
-"""The text of reports: names of methods, masks and metrics, and sentences about their numbers."""
+"""Labels and sentences of reports: names of methods, masks and metrics, and verdicts."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ METHOD_NAMES = {
     "reproject": "reprojection, no network",
     "copy": "copying the last frame",
 }
-"""Names of the methods, in the order of the tables."""
+"""Labels of the methods, in the order of the tables."""
 OWN_METHODS = ("memory", "model")
-"""The rows of the evaluated model itself: with its map, or a model that has no memory. A report has
-one of them."""
+"""Keys of the evaluated model itself: with its map, or a model that has no memory. A report has one
+of them."""
 RIVALS = {
     "reproject": "reprojecting what was observed",
     "none": "a model trained as long without a memory",
     "empty": "an empty map",
 }
-"""What the model is compared with, in sentences."""
+"""Names of the reference methods, in sentences."""
 OWN_NAMES = {"memory": "The model with its map", "model": "The model, which has no memory,"}
-"""The model itself in sentences, by its row."""
+"""Names of the model itself in sentences, by its key."""
 NO_MEMORY = (
     "This model was trained without a memory, so there is no map and no row with an empty map. To "
     "measure what a memory adds, compare it with a run that has one (`pewm-jax compare`, or --none "
     "of that run)."
 )
 MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
-"""Names of the masks."""
+"""Labels of the masks."""
 METRIC_NAMES = {
     "psnr": ("PSNR, dB ↑", 2),
     "ssim": ("SSIM ↑", 3),
@@ -41,8 +41,8 @@ METRIC_NAMES = {
     "depth_rel": ("relative depth error ↓", 3),
     "lpips": ("LPIPS ↓", 3),
 }
-"""Heading and digits of each metric. LPIPS is of whole pictures; its heading names its network
-(``heading``)."""
+"""Heading and number of digits of each metric. LPIPS is measured on whole images; its heading names
+its network (``heading``)."""
 COVERAGE_NAMES = {
     "held": "held by the map",
     "looked_at": "looked at by the model's reader",
@@ -50,7 +50,7 @@ COVERAGE_NAMES = {
     "chosen": "among the tokens chosen for attention",
     "attended": "among those that the frame's own camera would attend to",
 }
-"""Shares of the pixels seen before."""
+"""Labels of the shares of pixels seen before."""
 ACTIONS_NAMES = {
     "true": "the true actions",
     "shuffled": "another clip's actions",
@@ -60,20 +60,21 @@ ACTIONS_NAMES = {
     "true - none": "true minus none",
     "true - copy": "true minus the observed frame",
 }
-"""Names of the kinds of actions that a model was given, and of their differences."""
+"""Labels of the kinds of actions given to a model, and of their differences."""
 NONE_HOW = (
-    "A row for a model trained as long without a memory is missing: train one of the same clip, "
-    "codec and number of steps with all steps in stage 1 (--train.stage1.steps N "
-    "--train.stage2.steps 0) and name its folder by --none."
+    "There is no row for a model trained equally long without a memory: train one with the same "
+    "clip, codec and number of steps, all in stage 1 (--train.stage1.steps N --train.stage2.steps "
+    "0), "
+    "and give its folder by --none."
 )
 NONE_LACKING = (
-    "There is no row for a model that was trained as long without a memory: name the folder of one "
+    "There is no row for a model trained equally long without a memory: give the folder of one "
     "by --none."
 )
 
 
 def own_method(names: Iterable[str]) -> str:
-    """Return which of the methods is the evaluated model: ``memory``, or ``model`` without one."""
+    """Return the key of the evaluated model: ``memory``, or ``model`` without a memory."""
     found = set(names)
     return next(name for name in OWN_METHODS if name in found)
 
@@ -83,7 +84,7 @@ def heading(metric: str, protocol: Mapping[str, Any]) -> str:
 
     Args:
         metric: key of ``METRIC_NAMES``.
-        protocol: of ``metrics.json``.
+        protocol: entry ``protocol`` of ``metrics.json``.
     """
     text, network = METRIC_NAMES[metric][0], protocol.get("lpips_name")
     return text.replace("LPIPS", network) if network else text
@@ -100,14 +101,14 @@ def spread(entry: Mapping[str, Any], digits: int, *, sign: bool = False) -> str:
 
 
 def format_verdict(entry: Mapping[str, Any], where: str) -> str:
-    """Return a sentence on what the map changes (PSNR of memory minus empty)."""
+    """Return a sentence on the effect of the map (PSNR with minus without it)."""
     mean, stderr = entry["mean"], entry["stderr"]
     if mean is None:
         return f"No clip has enough pixels {where} to compare."
     if stderr is None:
         return (
-            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; with clips of one place "
-            "only, how sure that is cannot be said."
+            f"On pixels {where} the map changes PSNR by {mean:+.2f} dB; the uncertainty cannot be "
+            "estimated from clips of one place."
         )
     amount = f"{abs(mean):.2f} ± {stderr:.2f} dB"
     if mean > 2 * stderr:
@@ -119,7 +120,7 @@ def format_verdict(entry: Mapping[str, Any], where: str) -> str:
 
 
 def format_comparison(margin: Mapping[str, Any], rival: str, own: str = "memory") -> str:
-    """Return a sentence on whether the model beats another method, mask by mask.
+    """Return a sentence that compares the model with another method, per mask.
 
     Args:
         margin: ``[mask]["psnr"]`` of the model minus the rival.
@@ -140,7 +141,7 @@ def _outcome(entry: Mapping[str, Any]) -> str:
     if mean is None:
         return "there is nothing to compare"
     if stderr is None:
-        return f"{mean:+.2f} dB in one place, how sure cannot be said"
+        return f"{mean:+.2f} dB in one place, uncertainty unknown"
     amount = f"{mean:+.2f} ± {stderr:.2f} dB"
     if abs(mean) <= 2 * stderr:
         return f"no clear difference ({amount})"
@@ -148,7 +149,7 @@ def _outcome(entry: Mapping[str, Any]) -> str:
 
 
 def format_drift(drift: Mapping[str, Any]) -> str:
-    """Return a sentence on how long rollouts of the model change.
+    """Return a sentence on the drift of the model's long rollouts.
 
     Args:
         drift: ``statistics.drift`` of the model's own row.
@@ -163,23 +164,23 @@ def format_drift(drift: Mapping[str, Any]) -> str:
 
 
 def format_coverage(shares: Mapping[str, float]) -> str:
-    """Return a sentence on what the map knows of the pixels seen before."""
+    """Return a sentence on the map's coverage of the pixels seen before."""
     said = (f"{100 * shares[key]:.1f} % {name}" for key, name in COVERAGE_NAMES.items())
     return f"Of the pixels seen before: {', '.join(said)}."
 
 
 def format_lpips(metrics: Mapping[str, Any]) -> str:
-    """Return a sentence on LPIPS, or on why it was left out."""
+    """Return a sentence on LPIPS, or the reason why it was not measured."""
     found = {method: masks["all"].get("lpips") for method, masks in metrics["results"].items()}
     if not all(found.values()):
         return metrics["protocol"]["lpips"]
     said = (f"{label} {number(found[m], 3)}" for m, label in METHOD_NAMES.items() if m in found)
     name = metrics["protocol"].get("lpips_name") or "LPIPS"
-    return f"{name} of whole pictures, lower is better: {'; '.join(said)}."
+    return f"{name} of whole images, lower is better: {'; '.join(said)}."
 
 
 def format_fvd(metrics: Mapping[str, Any]) -> str:
-    """Return a sentence on FVD and KVD, or on why they were left out."""
+    """Return a sentence on FVD and KVD, or the reason why they were not measured."""
     found = metrics["videos"]
     if not found:
         return metrics["protocol"]["fvd"]
@@ -195,7 +196,7 @@ def format_fvd(metrics: Mapping[str, Any]) -> str:
 
 
 def format_mirror(metrics: Mapping[str, Any]) -> str:
-    """Return a sentence on the mirror test, or on why it was left out."""
+    """Return a sentence on the mirror test, or the reason why it was skipped."""
     found = metrics["mirror"]
     if not found:
         return metrics["protocol"]["mirror"]
@@ -226,9 +227,9 @@ def format_scs(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def format_steering(metrics: Mapping[str, Any]) -> list[str]:
-    """Return a sentence on whether the model follows its actions, or on why that is not known.
+    """Return a sentence on whether the model follows its actions, or why that is unknown.
 
-    There is none of a model that is not steered by actions.
+    Empty for a model that is not controlled by actions.
     """
     found = metrics.get("steering")
     if not found:
@@ -251,13 +252,13 @@ def format_map_growth(metrics: Mapping[str, Any]) -> list[str]:
     held = found["occupied"]["mean"]
     said = (
         f"Along long rollouts the map grows from {held[0]:.0f} to {held[-1]:.0f} points in "
-        f"{found['frames'][-1]} imagined frames, of {found['capacity']} that it has room for."
+        f"{found['frames'][-1]} imagined frames, with a capacity of {found['capacity']}."
     )
     return [said]
 
 
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Return the report's sentences, for the terminal: against the baselines, then the map alone.
+    """Return the report's sentences for the terminal: baselines first, then the map.
 
     Args:
         metrics: the content of ``metrics.json``.

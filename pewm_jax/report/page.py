@@ -1,7 +1,7 @@
-"""The one HTML page: sections of text, tables, figures and charts, written by one template.
+"""A self-contained HTML page: sections of text, tables, figures and charts, from one template.
 
-A page needs no other file unless a figure names one, and it is legible in light and dark. Texts are
-plain; what stands between backticks is shown as code.
+A page needs no other file unless a figure names one, and it is legible in light and dark mode.
+Texts are plain; text between backticks is shown as code.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ class TableBlock:
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """A picture or a video.
+    """An image or a video.
 
     Attributes:
         content: the file's bytes, which the page embeds, or the name of a file beside the page.
         media: its media type, such as ``image/png``.
-        alt: what a picture shows.
+        alt: alternative text of an image.
         caption: a text below it.
     """
 
@@ -66,7 +66,7 @@ class Figure:
 
     @property
     def source(self) -> str:
-        """The figure's address."""
+        """Return the figure's address."""
         if isinstance(self.content, str):
             return self.content
         return data_uri(self.content, self.media)
@@ -103,7 +103,7 @@ Block: TypeAlias = Text | Bullets | TableBlock | Figure | Charts | Facts | Detai
 
 @dataclasses.dataclass(frozen=True)
 class Section:
-    """A heading, which may be empty, and what stands below it."""
+    """A heading, which may be empty, and its content."""
 
     title: str
     blocks: Sequence[Block]
@@ -115,7 +115,7 @@ def render(title: str, opening: Sequence[Block], sections: Sequence[Section | No
     Args:
         title: its title; a line break starts a new line.
         opening: the blocks before the first section.
-        sections: the sections; None is left out.
+        sections: the sections; None is skipped.
     """
     return _template().render(
         title=title.replace("\n", ", "),
@@ -126,7 +126,7 @@ def render(title: str, opening: Sequence[Block], sections: Sequence[Section | No
 
 
 def data_uri(content: bytes, media: str = "image/png") -> str:
-    """Return bytes as an address that a page embeds."""
+    """Return bytes as a data URI."""
     return f"data:{media};base64,{base64.b64encode(content).decode()}"
 
 

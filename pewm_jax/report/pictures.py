@@ -23,7 +23,7 @@ so on."""
 
 
 def picture_steps(frames: int) -> np.ndarray:
-    """Return the steps of a rollout that are shown as pictures; 0 is the present."""
+    """Return the steps of a rollout that are shown as images; 0 is the present."""
     return np.unique(np.round(np.linspace(0, frames, 8)).astype(int))
 
 
@@ -83,14 +83,14 @@ def grid(
     """Arrange images in a captioned grid.
 
     Args:
-        rows: caption and pictures (uint8, any size of one shape) of each row.
+        rows: caption and images (uint8, all of one shape) of each row.
         columns: captions above the columns.
-        title: a line above everything.
-        cell: width of a picture, pixels.
-        gap: space between pictures, pixels.
+        title: a line above the grid.
+        cell: width of an image, pixels.
+        gap: space between images, pixels.
 
     Returns:
-        One uint8 picture with even sides.
+        One uint8 image with even sides.
     """
     tall = round(rows[0][1][0].shape[0] * cell / rows[0][1][0].shape[1])
     left = 16 + max(int(font(15).getlength(caption)) for caption, _ in rows) + 10
@@ -120,7 +120,7 @@ def grid(
 
 
 def png(image_HWC: np.ndarray) -> bytes:
-    """Encode a uint8 picture as PNG."""
+    """Encode a uint8 image as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(image_HWC).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
@@ -148,7 +148,7 @@ def from_above(
     """Draw a map's cells from above, lower cells first, with the agent's path.
 
     Args:
-        points_world_P3: centres of the occupied cells, metres; the ceiling already removed.
+        points_world_P3: centres of the occupied cells, metres; without the ceiling.
         colours_P3: uint8 colours.
         cell_m: size of a cell.
         path_T3: camera positions, oldest first; the last one gets an arrow.

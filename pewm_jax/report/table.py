@@ -1,7 +1,7 @@
 """One table, written as HTML, Markdown, LaTeX, CSV or aligned text.
 
 A table is a header and rows of cells. A cell is a text or a number with its uncertainty, so every
-form shows the same digits. ``benchmarks``, reports and studies all build their tables here.
+format shows the same digits. ``benchmarks``, reports and studies all build their tables here.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from html import escape
 from typing import Any, Literal, TypeAlias
 
 MISSING = "–"
-"""What a cell without a value shows."""
+"""Text of a cell without a value."""
 _LATEX = {
     "–": "--",
     "%": r"\%",
@@ -23,7 +23,7 @@ _LATEX = {
     "↓": r"$\downarrow$",
     "↑": r"$\uparrow$",
 }
-"""Characters and what LaTeX writes for them."""
+"""Characters and their LaTeX escapes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Cell:
         value: the text or the number; None shows a dash.
         digits: decimals of the number and of its uncertainty.
         error: half-width or standard error, shown as ``± error``.
-        interval: lower and upper end, shown in brackets.
-        sign: whether a plus is shown.
-        mark: text after everything else, such as ``*``.
+        interval: lower and upper bound, shown in brackets.
+        sign: whether a plus sign is shown.
+        mark: text at the end, such as ``*``.
         best: whether the cell is emphasized.
     """
 
@@ -50,14 +50,14 @@ class Cell:
 
     @property
     def main(self) -> str:
-        """The value without its uncertainty."""
+        """Return the value without its uncertainty."""
         if self.value is None:
             return MISSING
         return self.value if isinstance(self.value, str) else self._format(self.value)
 
     @property
     def uncertainty(self) -> str:
-        """The uncertainty as ``± 0.1`` or ``[0.1, 0.3]``; "" if there is none."""
+        """Return the uncertainty as ``± 0.1`` or ``[0.1, 0.3]``; "" if there is none."""
         if self.value is None:
             return ""
         if self.error is not None:
@@ -101,7 +101,7 @@ class Row:
     """A row of a table.
 
     Attributes:
-        cells: its cells; of a heading the text alone.
+        cells: its cells; a heading has only its text.
         kind: ``heading`` spans all columns, ``highlight`` is tinted.
         rule: whether LaTeX draws a rule above it.
     """
@@ -112,7 +112,7 @@ class Row:
 
 
 def row(*cells: CellLike, highlight: bool = False, rule: bool = False) -> Row:
-    """Return a row; texts may stand for cells."""
+    """Return a row; texts are converted to cells."""
     return Row(_cells(cells), "highlight" if highlight else "plain", rule)
 
 
@@ -134,7 +134,7 @@ class Table:
         return cls(tuple(header), [row(*cells) for cells in rows])
 
     def html(self) -> str:
-        """Return a ``<table>`` in a box that scrolls where the page is too narrow."""
+        """Return a ``<table>`` in a box that scrolls horizontally if the page is too narrow."""
         lines = []
         for line in self.rows:
             if line.kind == "heading":

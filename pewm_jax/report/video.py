@@ -25,10 +25,10 @@ def side_by_side(
         columns: caption, colours (T, H, W, 3) and depth (T, H, W) of each version.
         footers: T lines, one under each frame.
         far_m: depth drawn darkest.
-        cell: width of a picture, pixels.
+        cell: width of an image, pixels.
 
     Returns:
-        T uint8 pictures of one size with even sides.
+        T uint8 images of one size with even sides.
     """
     height, width = columns[0][1].shape[1:3]
     tall = round(height * cell / width)
@@ -55,10 +55,10 @@ def small_frames(columns: Sequence[tuple[str, np.ndarray]], *, cell: int = 160) 
 
     Args:
         columns: caption and colours (T, H, W, 3) of each version.
-        cell: width of a picture, pixels.
+        cell: width of an image, pixels.
 
     Returns:
-        T uint8 pictures of one size.
+        T uint8 images of one size.
     """
     height, width = columns[0][1].shape[1:3]
     header, gap = 20, 4
@@ -76,7 +76,7 @@ def small_frames(columns: Sequence[tuple[str, np.ndarray]], *, cell: int = 160) 
 
 
 def encode_gif(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:
-    """Encode uint8 pictures (H, W, 3), all of one size, as a GIF that begins again at its end."""
+    """Encode uint8 images (H, W, 3), all of one size, as a looping GIF."""
     buffer = io.BytesIO()
     first, *others = [Image.fromarray(picture) for picture in pictures]
     first.save(
@@ -92,10 +92,10 @@ def encode_gif(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> by
 
 
 def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:
-    """Encode pictures as an MP4 with H.264, yuv420p; equal pictures give equal bytes.
+    """Encode images as an MP4 with H.264, yuv420p; equal images give equal bytes.
 
     Args:
-        pictures: uint8 (H, W, 3) with even sides, all of one size.
+        pictures: uint8 (H, W, 3) images with even sides, all of one size.
         frames_per_second: playing speed.
     """
     buffer = io.BytesIO()
@@ -107,17 +107,17 @@ def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> b
 
 
 class Film:
-    """An MP4 with H.264 that is written picture by picture, so that none has to be kept.
+    """An MP4 with H.264 that is written image by image, so that none has to be stored.
 
-    x264 is used without its macroblock tree, whose vectorised code reads memory that nobody wrote:
-    with it, a few bits differ from run to run.
+    x264 is used without its macroblock tree, whose vectorised code reads uninitialised memory: with
+    it, a few bits differ from run to run.
     """
 
     def __init__(self, where: io.BytesIO | str, size: tuple[int, int], frames_per_second: int = 4):
-        """Begin.
+        """Open the file.
 
         Args:
-            where: a buffer, or the name of a file to write.
+            where: a buffer, or the path of a file.
             size: height and width, even.
             frames_per_second: playing speed.
         """
@@ -133,11 +133,11 @@ class Film:
         }
 
     def add(self, picture: np.ndarray) -> None:
-        """Append a uint8 (H, W, 3) picture of the film's size."""
+        """Append a uint8 (H, W, 3) image of the film's size."""
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
         self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
-        """Write what is left; the film can be played."""
+        """Flush and finish the file."""
         self._container.mux(self._stream.encode())
         self._container.close()

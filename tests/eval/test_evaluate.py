@@ -360,7 +360,7 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     name = f"LPIPS[vgg-{tree.digest(weights.load(path))[:8]}]"  # weights of one's own
     assert f"{name} ↓" in page
     assert "not resized" in page
-    assert any(line.startswith(f"{name} of whole pictures, lower is better") for line in said)
+    assert any(line.startswith(f"{name} of whole images, lower is better") for line in said)
     said.clear()
     report.evaluate(copied, log=said.append, clips=3, seeds=(0,), lpips=path)
     assert "nothing to do" in said[-1]
@@ -690,7 +690,7 @@ def test_verdicts_are_fair():
     assert "3.00 ± 0.50 dB closer" in format_verdict({"mean": 3.0, "stderr": 0.5}, "seen before")
     assert "worse" in format_verdict({"mean": -3.0, "stderr": 0.5}, "seen before")
     assert "no clear difference" in format_verdict({"mean": 0.6, "stderr": 0.5}, "never seen")
-    assert "cannot be said" in format_verdict({"mean": 0.6, "stderr": None}, "never seen")
+    assert "cannot be estimated" in format_verdict({"mean": 0.6, "stderr": None}, "never seen")
     assert "No clip" in format_verdict({"mean": None, "stderr": None}, "never seen")
     assert number({"mean": 1.0, "stderr": 0.25}, 2, sign=True) == "+1.00 ± 0.25"
     assert number({"mean": None, "stderr": None}, 2) == "–"
@@ -707,7 +707,7 @@ def test_whether_a_baseline_is_beaten_is_said_plainly():
     assert "never seen it is better (+3.00 ± 0.50 dB)" in said
     assert "over all no clear difference" in said
     unsure = {"seen": entry(1.0, None), "unseen": entry(None, None), "all": entry(1.0, None)}
-    assert "cannot be said" in format_comparison(unsure, "none")
+    assert "uncertainty unknown" in format_comparison(unsure, "none")
     assert "nothing to compare" in format_comparison(unsure, "none")
     short = {"first16": None, "last16": None, "difference": None}
     assert "fewer than 32" in format_drift(short)

@@ -96,7 +96,7 @@ def test_what_cannot_be_planned_is_refused_before_anything_is_compiled(monkeypat
 
 
 def test_too_few_devices_in_use_already_are_named():
-    with pytest.raises(UserError, match="a process of its own"):
+    with pytest.raises(UserError, match="a process in which JAX has not"):
         measure.virtual(len(jax.devices()) + 1)
 
 

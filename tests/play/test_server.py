@@ -168,7 +168,7 @@ def test_which_visitors_are_welcome():
         ("https://Box.example", "box.example:443", ("box.example",)),
         ("https://box.example", "127.0.0.1:8080", ("box.example",)),  # a proxy that renames
     ):
-        assert serving.objection(origin, host, here, names) == "", (origin, host)
+        assert serving.rejection_reason(origin, host, here, names) == "", (origin, host)
     for origin, host, names in (
         ("http://localhost:8080", "localhost:8081", ()),
         ("https://localhost", "localhost:80", ()),
@@ -178,11 +178,11 @@ def test_which_visitors_are_welcome():
         (None, None, ("",)),
         (None, "localhost:port", ()),
     ):
-        assert serving.objection(origin, host, here, names), (origin, host)
-    assert serving.objection("http://box:80", "box", "box") == ""
+        assert serving.rejection_reason(origin, host, here, names), (origin, host)
+    assert serving.rejection_reason("http://box:80", "box", "box") == ""
     for odd in ("a;b", "a\udc9b", "a b", "<b>", "a" * 300):
         for origin, host in ((None, odd), (f"http://{odd}", "localhost")):
-            said = serving.objection(origin, host, here)
+            said = serving.rejection_reason(origin, host, here)
             assert said.isascii()
             assert "--names" not in said
 

@@ -237,7 +237,7 @@ def write_recording(folder, frames):
 
 def test_a_world_of_blocks_does_not_begin_with_surfaces():
     places.require_shown(MODEL, Start())
-    with pytest.raises(UserError, match="knows pictures of blocks"):
+    with pytest.raises(UserError, match="was trained on images of blocks"):
         places.require_shown(PERSIST, Start())
     surfaces = dataclasses.replace(PERSIST.memory, pictures="surfaces")
     places.require_shown(

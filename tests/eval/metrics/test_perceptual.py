@@ -217,6 +217,6 @@ def test_tables_have_lpips_of_whole_pictures_and_only_where_it_was_measured():
     assert frames == pytest.approx([0.2, 0.3, 0.4, 0.5])
     said = format_lpips({"results": results, "protocol": {"lpips_name": "LPIPS[alex]"}})
     assert said.startswith(
-        "LPIPS[alex] of whole pictures, lower is better: with its map 0.250 ± 0.000"
+        "LPIPS[alex] of whole images, lower is better: with its map 0.250 ± 0.000"
     )
     assert "same weights, empty map 0.350" in said
