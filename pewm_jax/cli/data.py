@@ -1,4 +1,4 @@
-"""Run ``pewm-jax data`` and ``pewm-jax memory``, and choose what some commands read."""
+"""Run ``pewm-jax data`` and ``pewm-jax memory``, and select the settings of some commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pewm_jax.cli.parser import Arguments
 
 
 def collect_arguments(argv: Sequence[str], prog: str) -> Arguments:
-    """Return what ``data collect`` reads: with ``--env`` it collects from a user's environment."""
+    """Return the arguments of ``data collect``; with ``--env``, those for a user's environment."""
     if any(word.split("=")[0] == "--env" for word in argv):
         from pewm_jax.data.collect_env import CollectEnvConfig
 
@@ -43,7 +43,7 @@ def import_recording(settings: Any) -> None:
 
 
 def validate(settings: Any) -> int:
-    """Run ``data validate``; returns 1 if there are problems."""
+    """Run ``data validate``; return 1 if there are problems."""
     from pewm_jax.data.validate import validate as find_problems
 
     return 1 if find_problems(settings).problems else 0
@@ -66,7 +66,7 @@ def cache_features(settings: Any) -> None:
 
 @contextlib.contextmanager
 def _resumable() -> Iterator[None]:
-    """Say after Ctrl-C that the same command resumes."""
+    """Print after Ctrl-C that the same command resumes."""
     try:
         yield
     except KeyboardInterrupt:

@@ -13,27 +13,27 @@ from pewm_jax.config import ModelConfig
 from pewm_jax.errors import ConfigError
 
 SIZE = 64
-"""Width and height that `data collect` gives pictures by default, pixels."""
+"""Default width and height of the images of `data collect`, pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Collect walks through generated houses, train a world model on them and score it.
+    """Collect walks through generated houses, train a world model on them and evaluate it.
 
-    It is scored on imagined walks through houses that were not in training. If interrupted, run it
-    again: it resumes.
+    It is evaluated on imagined walks through held-out houses. If interrupted, run it again: it
+    resumes.
     """
 
     preset: str = "demo"
-    """Preset that is trained; `pewm-jax train --help` lists them."""
+    """Preset to train; `pewm-jax train --help` lists them."""
     data: Path = Path("data/demo")
     """Folder of the walks."""
     run: Path = Path("runs/demo")
     """Folder of the training and of the report."""
     houses: int = 144
-    """Houses to train in; there are others to be scored in."""
+    """Number of training houses; held-out ones are generated in addition."""
     frames: int = 80
-    """Frames of a walk."""
+    """Frames per walk."""
 
     def __post_init__(self):
         """Validate."""
@@ -45,17 +45,17 @@ class Settings:
 
     @property
     def size(self) -> int:
-        """Width and height of the preset's pictures, pixels.
+        """Return width and height of the preset's images, pixels.
 
         Raises:
             ConfigError: they are not square, or the preset is not of a world with a map.
         """
         model = presets.load(self.preset).model
-        maps = type(model) is ModelConfig  # of other worlds, which need other data
+        maps = type(model) is ModelConfig  # other worlds need other data
         if not maps or model.clip.width != model.clip.height:
             raise ConfigError(
                 f"--preset {self.preset} does not fit the demo, which trains a world with a map on "
-                "square pictures: take demo, or the steps one by one."
+                "square images: use demo, or run the steps one by one."
             )
         return model.clip.width
 
@@ -74,7 +74,7 @@ def run(settings: Settings) -> int:
 
 
 def steps(settings: Settings) -> list[tuple[str, list[str]]]:
-    """Return what each step does, and the words of its command."""
+    """Return the description and the command line of each step."""
     walks, folder = str(settings.data), str(settings.run)
     collect = ["collect", walks, "--train", str(settings.houses), "--frames", str(settings.frames)]
     if settings.size != SIZE:
@@ -83,7 +83,7 @@ def steps(settings: Settings) -> list[tuple[str, list[str]]]:
     return [
         ("Walking through generated houses", ["data", *collect]),
         ("Training a world model", ["train", *learn]),
-        ("Imagining walks and scoring them", ["evaluate", folder]),
+        ("Imagining walks and evaluating them", ["evaluate", folder]),
     ]
 
 
@@ -92,22 +92,22 @@ def ending(run: Path, viewer: bool) -> str:
 
     Args:
         run: the folder of the training.
-        viewer: whether what the viewer needs is installed.
+        viewer: whether the viewer's dependencies are installed.
     """
     install = "" if viewer else "pip install 'pewm-jax[play]' && "
     return (
-        f"Done. Open {run / 'report' / 'index.html'} in a browser: pictures, videos and scores of "
-        f"what was imagined. {run / 'config.json'} holds the settings. Drive in it: "
+        f"Done. Open {run / 'report' / 'index.html'} in a browser: images, videos and scores of "
+        f"the imagined walks. {run / 'config.json'} contains the settings. Drive in it: "
         f"{install}pewm-jax play {shlex.quote(str(run))}"
     )
 
 
 def _require_folder(settings: Settings) -> None:
-    """Refuse a folder that training would refuse, before collecting; makes none."""
+    """Raise an error before collecting if training would reject the folder; create none."""
     there = next(path for path in (settings.run, *settings.run.parents) if path.exists())
     if there != settings.run and there.is_dir():
         return
-    from pewm_jax.train import runs  # here: help and refusals are fast
+    from pewm_jax.train import runs  # imported lazily, for fast help and errors
 
     config = presets.load(settings.preset)
     where = dataclasses.replace(config.data, path=str(settings.data))
@@ -116,7 +116,7 @@ def _require_folder(settings: Settings) -> None:
 
 
 def _viewer() -> bool:
-    """Tell whether what the viewer needs is installed."""
+    """Return whether the viewer's dependencies are installed."""
     try:
         importlib.metadata.version("viser")
     except importlib.metadata.PackageNotFoundError:

@@ -21,9 +21,9 @@ SCORED = (
     *("split", "clips", "seeds", "chain", "stride", "videos", "video_clips", "batch"),
     *("none", "lpips", "protocol", "fvd", "mirror", "src", "scs"),
 )
-"""Settings of ``EvalConfig`` that ``evaluate`` takes."""
+"""Settings of ``EvalConfig`` that are flags of ``evaluate``."""
 CHOSEN = ("split", "clips", "seeds", "chain", "stride", "video_clips")
-"""Settings of ``EvalConfig`` that ``protocol`` takes."""
+"""Settings of ``EvalConfig`` that are flags of ``protocol``."""
 if TYPE_CHECKING:
     Scored = Chosen = EvalConfig
 else:
@@ -35,28 +35,28 @@ UNCHANGED, UNCHOSEN = Scored(), Chosen()
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateSettings:
-    """Score a trained run on held-out scenes and write RUN/report/index.html.
+    """Evaluate a trained run on held-out scenes and write RUN/report/index.html.
 
-    Settings that are not given are those of the run. Several processes can share the work; all
-    must see the same folders.
+    The defaults are the settings of the run. Several processes can share the work; all must see the
+    same folders.
     """
 
     run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder, or the name of a model that comes with the library."""
+    """The run's folder, or the name of a model that ships with the library."""
     data: Path | None = None
     """Folder of the data set."""
     scored: Flat[Scored] = UNCHANGED
-    """What may differ from the run's own settings."""
+    """Settings that override those of the run."""
     steps: int | None = None
     """Sampling steps of the denoiser."""
     out: Path | None = None
-    """Folder of the report; by default RUN/report, or RUN/report-NAME for other data than the
-    run's own."""
+    """Folder of the report; by default RUN/report, or RUN/report-NAME for other data than the run's
+    own."""
     join: Flat[Join] = JOIN
     """The processes that share the work."""
 
     def changes(self) -> dict[str, Any]:
-        """Return what may differ from the run's settings; None for what was not given."""
+        """Return the overrides of the run's settings; None for those not given."""
         return {**vars(self.scored), "data": self.data, "steps": self.steps}
 
 
@@ -67,12 +67,12 @@ def evaluate(settings: EvaluateSettings) -> None:
     if config is not None and isinstance(config.model, configuration.CodecWorldConfig):
         if settings.join.distributed:
             raise ConfigError(
-                f"{run} holds a codec: one process scores it; leave out --distributed."
+                f"{run} contains a codec, which one process evaluates: omit --distributed."
             )
         runtime.cache_compilation(Path(run).parent)
         _score_codec(settings)
         return
-    # Imported here and not above: help and refusals are fast, and Ctrl-C is clean meanwhile.
+    # Imported lazily: help and errors are fast, and Ctrl-C is clean meanwhile.
     from pewm_jax.train import processes
 
     with processes.joined(settings.join):
@@ -95,26 +95,27 @@ def _read_config(run: Path) -> configuration.Config | None:
 
 
 def _score_codec(settings: EvaluateSettings) -> None:
-    """Print the numbers of a codec."""
+    """Print the scores of a codec."""
     from pewm_jax.eval import codec_score
 
-    given = {name: value for name, value in settings.changes().items() if value is not None}
-    given |= {} if settings.out is None else {"out": settings.out}
-    chosen = {name: given.pop(name, None) for name in ("data", "split")}
-    if given:
+    unsupported = {name: value for name, value in settings.changes().items() if value is not None}
+    unsupported |= {} if settings.out is None else {"out": settings.out}
+    chosen = {name: unsupported.pop(name, None) for name in ("data", "split")}
+    if unsupported:
         raise ConfigError(
-            f"{settings.run} holds a codec, which is scored on the frames of --data and --split: "
-            f"leave out {', '.join('--' + name for name in given)}."
+            f"{settings.run} contains a codec, which is evaluated on the frames of --data and "
+            "--split: "
+            f"omit {', '.join('--' + name for name in unsupported)}."
         )
     print(f"numbers: {codec_score.score(settings.run, **chosen)}")
 
 
 @dataclasses.dataclass(frozen=True)
 class ProtocolSettings:
-    """Choose the clips that runs are scored on and write them to a file with a hash.
+    """Choose the clips of an evaluation and write them to a file with a hash.
 
-    The file fixes episodes, starts, context, motion, noise and horizon before training. Settings
-    that are not given are those of the preset or run. Then use `pewm-jax train …
+    The file fixes episodes, starts, context, motion, noise and horizon before training. The
+    defaults are the settings of the preset or run. Then use `pewm-jax train …
     --evaluate.protocol FILE`, or `pewm-jax evaluate RUN --protocol FILE`.
     """
 
@@ -123,17 +124,17 @@ class ProtocolSettings:
     data: Path | None = None
     """Folder of the data set."""
     chosen: Flat[Chosen] = UNCHOSEN
-    """What may differ from the settings of the preset or run."""
+    """Settings that override those of the preset or run."""
     context: int | None = None
-    """Frames observed before each clip."""
+    """Number of frames observed before each clip."""
     out: Path = Path("protocol.json")
     """The file to write. An existing file with another protocol is not overwritten."""
 
 
 def protocol(settings: ProtocolSettings) -> None:
-    """Write a protocol's file and print its hash."""
+    """Write a protocol file and print its hash."""
     config = _with_changes(_settings_of(settings.name), settings)
-    # Imported here and not above: help and refusals are fast.
+    # Imported lazily: help and errors are fast.
     from pewm_jax.eval import protocol as protocols
 
     protocols.write_protocol(config, settings.out, print)
@@ -141,7 +142,7 @@ def protocol(settings: ProtocolSettings) -> None:
 
 
 def _settings_of(name: str) -> Config:
-    """Return the settings of a preset, or of a run or weights that come with the library."""
+    """Return the settings of a preset, or of a run or weights that ship with the library."""
     file = shipped.find(name) / "config.json"
     if name not in presets.names() and file.is_file():
         config = configuration.load(file)
@@ -149,30 +150,32 @@ def _settings_of(name: str) -> Config:
         config = presets.load(parser.choose(name, presets.names(), "preset or run"))
     if not isinstance(config.model, World):
         raise ConfigError(
-            f"{name} trains no world model, and protocols are of rollouts: leave it to "
-            "`pewm-jax evaluate`."
+            f"{name} trains no world model, but protocols are for rollouts: use "
+            "`pewm-jax evaluate` without one."
         )
     return config
 
 
 def _with_changes(config: Config, settings: ProtocolSettings) -> Config:
-    """Return the settings with those that were given in their place."""
-    given = {name: value for name, value in vars(settings.chosen).items() if value is not None}
+    """Return the settings with the given overrides."""
+    unsupported = {
+        name: value for name, value in vars(settings.chosen).items() if value is not None
+    }
     data = {} if settings.data is None else {"path": str(settings.data)}
     data |= {} if settings.context is None else {"context": settings.context}
     return dataclasses.replace(
         config,
         data=dataclasses.replace(config.data, **data),
-        evaluate=dataclasses.replace(config.evaluate, **given),
+        evaluate=dataclasses.replace(config.evaluate, **unsupported),
     )
 
 
 @dataclasses.dataclass(frozen=True)
 class CompareSettings:
-    """Compare two runs that `pewm-jax evaluate` has scored by the same protocol.
+    """Compare two runs that `pewm-jax evaluate` has scored with the same protocol.
 
-    Writes a page with paired differences, 95 % intervals over houses, and pictures. A run may also
-    be the folder of one of its reports. Runs that were scored by different protocols are refused.
+    Writes a page with paired differences, 95 % intervals over houses, and images. Instead of a run,
+    the folder of one of its reports can be given. Runs with different protocols are an error.
     """
 
     run_a: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_A")]
@@ -180,17 +183,17 @@ class CompareSettings:
     run_b: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN_B")]
     """The second run."""
     also_a: tuple[str, ...] = ()
-    """Runs that differ from the first in --train.seed alone: intervals over training seeds are then
-    given too, apart from those over houses."""
+    """Runs that differ from the first only in --train.seed; adds intervals over training seeds,
+    separate from those over houses."""
     also_b: tuple[str, ...] = ()
-    """Runs that differ from the second in --train.seed alone."""
+    """Runs that differ from the second only in --train.seed."""
     out: Path | None = None
     """Folder of the page; by default compare-NAME in the first run's folder."""
 
 
 def compare(settings: CompareSettings) -> None:
     """Write the page and print its path."""
-    # Imported here and not above: help and refusals are fast.
+    # Imported lazily: help and errors are fast.
     from pewm_jax.eval import compare as comparison
 
     page = comparison.compare(

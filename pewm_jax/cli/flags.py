@@ -1,4 +1,4 @@
-"""Names of an experiment's flags: short forms, old names, and flags that choose kinds.
+"""Names of an experiment's flags: short forms, old names, and flags that select kinds.
 
 ``--clip.width 64`` is short for ``--model.clip.width 64``. Names from earlier versions are
 accepted. ``--model.memory.kind images`` replaces a section's settings by those of another kind;
@@ -25,7 +25,7 @@ def full_names(flags: Sequence[str], default: Any) -> list[str]:
 
     Args:
         flags: the arguments.
-        default: the settings that they change.
+        default: the settings that they override.
     """
     if not isinstance(default, Config):
         return list(flags)
@@ -55,21 +55,21 @@ def full_names(flags: Sequence[str], default: Any) -> list[str]:
 
 
 def _renamed(model: Any) -> dict[str, str]:
-    """Return earlier names of a world's settings, with their names now."""
+    """Return earlier names of a world's settings → present names."""
     fields = {field.name for field in dataclasses.fields(model)}
     tables = RENAMED_SETTINGS.values()
     return {old: new for table in tables for old, new in table.items() if new in fields}
 
 
 def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
-    """Take ``--SECTION.kind NAME`` out of the arguments.
+    """Apply ``--SECTION.kind NAME`` and remove it from the arguments.
 
     Args:
         flags: the arguments, by their full names.
-        default: the settings that they change.
+        default: the settings that they override.
 
     Returns:
-        The default with settings of the chosen kinds, which need not fit each other yet, and the
+        The default with settings of the chosen kinds, which may still be inconsistent, and the
         other arguments.
 
     Raises:
@@ -99,7 +99,7 @@ def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
 
 
 def flags_of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
-    """Yield the flags of settings (or of a dataclass type), nested ones too, with their fields."""
+    """Yield the flags of settings (or of a dataclass type), including nested ones, and fields."""
     instance = None if isinstance(settings, type) else settings
     if isinstance(instance, Settings) and prefix != "--":
         yield f"{prefix}kind", None
@@ -116,7 +116,7 @@ def flags_of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
 
 
 def kinds_text(default: Any, prefix: str = "") -> str:
-    """Return one line for each section that has several kinds, for the help text."""
+    """Return one line per section that has several kinds, for the help text."""
     lines = []
     for field in dataclasses.fields(default):
         value = getattr(default, field.name)
@@ -130,5 +130,5 @@ def kinds_text(default: Any, prefix: str = "") -> str:
         below = kinds_text(value, f"{name}.")
         lines += [below] if below else []
     if lines and not prefix:
-        lines.insert(0, "Parts of the model of which there are several kinds:")
+        lines.insert(0, "Parts of the model with several kinds:")
     return "\n".join(lines)

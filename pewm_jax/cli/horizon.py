@@ -1,4 +1,4 @@
-"""Run ``pewm-jax horizon``: imagine hundreds of frames, and measure them."""
+"""Run ``pewm-jax horizon``: imagine hundreds of frames, and evaluate them."""
 
 from __future__ import annotations
 
@@ -13,56 +13,56 @@ from pewm_jax.errors import ConfigError
 from pewm_jax.io import runtime
 
 SPARE = 4
-"""One spare walk for this many trials, because some walks have no room for a block."""
+"""One spare walk per this many trials, because some walks have no room for a block."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Imagine long walks through held-out houses with the recorded actions, and measure them.
+    """Imagine long walks through held-out houses with the recorded actions, and evaluate them.
 
-    The frames are compared with the ground truth by stretches (PSNR) and as sets of windows of 16
-    frames (FVD, KVD). For a world of voxels, its renderer is measured on the true voxels, and
-    trials measure whether a block that is placed in it stays.
+    The frames are compared with the ground truth by segment (PSNR) and as sets of windows of 16
+    frames (FVD, KVD). For a voxel world, its renderer is also evaluated with the true voxels, and
+    trials measure whether a block placed in it persists.
     """
 
     run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
-    """The run's folder, or the name of a model that comes with the library."""
+    """The run's folder, or the name of a model that ships with the library."""
     data: Path = Path("data/persist_long")
     """Folder of the data set; its episodes must be longer than the horizon."""
     split: str = "revisit"
-    """Folder inside it."""
+    """Split: a folder inside it."""
     beside: tuple[str, ...] = ()
-    """Other worlds (runs' folders or names of models that come with the library) that imagine the
+    """Other worlds (runs' folders or names of models that ship with the library) that imagine the
     same walks."""
     ends: tuple[int, ...] = (200, 400, 600)
-    """Frames at which windows end, and between which PSNR is averaged."""
+    """Frames at which windows end; also the ends of the segments over which PSNR is averaged."""
     walks: int = 4
-    """Walks, one of each episode; those of one episode's trials may overlap."""
+    """Number of walks, one per episode; those of one episode's trials may overlap."""
     context: int = 8
-    """Observed frames before each."""
+    """Number of observed frames before each walk."""
     fvd: Literal["on", "off"] = "off"
-    """Whether FVD and KVD are measured (`pip install 'pewm-jax[metrics]'`); on processors that
-    takes longer than imagining."""
+    """Measure FVD and KVD (`pip install 'pewm-jax[metrics]'`); on CPUs this takes longer than
+    imagining."""
     windows: int = 4
-    """Windows of each walk before each end."""
+    """Number of windows of each walk before each end."""
     trials: int = 0
-    """Walks in whose beginning a block is placed in a world of voxels, such as 40."""
+    """Number of walks at whose start a block is placed in a voxel world, such as 40."""
     trial_frames: int = 64
-    """Frames that are imagined after a block was placed."""
+    """Number of frames imagined after a block was placed."""
     out: Path | None = None
     """Folder of the report; by default RUN/horizon."""
 
 
 def run(settings: Settings) -> None:
-    """Measure, write RUN/horizon/horizon.html and print the numbers."""
+    """Evaluate, write RUN/horizon/horizon.html and print the scores."""
     ends = settings.ends
     if not ends or sorted(set(ends)) != list(ends) or ends[0] < 16:
         raise ConfigError(
-            f"--ends is {ends}: name rising numbers of frames from 16 on, such as 200 400 600."
+            f"--ends is {ends}: give increasing numbers of frames, 16 or more, such as 200 400 600."
         )
     if min(settings.walks, settings.context, settings.windows, settings.trial_frames) < 1:
         raise ConfigError("--walks, --context, --windows and --trial-frames must be above 0.")
-    # Imported here and not above: help and refusals are fast.
+    # Imported lazily: help and errors are fast.
     from pewm_jax.eval.loaded_run import open_run
     from pewm_jax.report import horizon_page
 
@@ -87,10 +87,11 @@ def run(settings: Settings) -> None:
 def _measured(
     settings: Settings, opened: Any, others: Sequence[tuple[str, Any]]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what is measured, and (B, T, H, W, 3) pictures by method, the truth first.
+    """Return the measurements, and (B, T, H, W, 3) frames by method, ground truth first.
 
     Raises:
-        ConfigError: the episodes are too few or too short, or trials are asked of another world.
+        ConfigError: the episodes are too few or too short, or trials are requested for another
+            world.
     """
     import numpy as np
 
@@ -105,8 +106,8 @@ def _measured(
     episodes = EpisodeSource(settings.data / settings.split)
     if len(episodes) < settings.walks:
         raise ConfigError(
-            f"--walks is {settings.walks}, and {settings.data}/{settings.split} has "
-            f"{len(episodes)} episodes: ask for as many, or collect more."
+            f"--walks is {settings.walks}, but {settings.data}/{settings.split} has "
+            f"{len(episodes)} episodes: request at most as many, or collect more."
         )
     config, params, ends = opened.config, opened.params, settings.ends
     first = settings.context - 1
@@ -115,9 +116,9 @@ def _measured(
     walks = [horizon.read_walk(one, first, ends[-1], settings.context) for one in chosen]
     tried = _tried(settings, chosen, first)
     of_voxels = isinstance(config.model, PersistConfig)
-    if tried:  # before hours of imagining
+    if tried:  # fail before hours of imagining
         if not of_voxels:
-            raise ConfigError("--trials places blocks in a world of voxels; this has none.")
+            raise ConfigError("--trials places blocks in a voxel world; this world has no voxels.")
         voxel_trials.block_class(config, tried)
     truth = np.stack([walk.truth_THWC for walk in walks])
     made: dict[str, Any] = {"world": horizon.imagine_walks(config, params, walks)}
@@ -144,7 +145,7 @@ def _measured(
 
 
 def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
-    """Return walks for the trials, spread over the episodes, with some to spare."""
+    """Return walks for the trials, spread over the episodes, including spare ones."""
     if not settings.trials:
         return []
     from pewm_jax.eval import horizon
@@ -153,8 +154,8 @@ def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
     starts = range(first, shortest - settings.trial_frames)
     if not starts:
         raise ConfigError(
-            f"--trial-frames is {settings.trial_frames}, and the shortest episode has {shortest} "
-            "frames: take fewer, or collect longer episodes."
+            f"--trial-frames is {settings.trial_frames}, but the shortest episode has {shortest} "
+            "frames: use fewer, or collect longer episodes."
         )
     wanted = settings.trials + -(-settings.trials // SPARE)
     each = -(-wanted // len(chosen))

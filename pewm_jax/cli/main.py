@@ -1,4 +1,4 @@
-"""The command ``pewm-jax``: the table of commands, and how one of them is found and run."""
+"""The command ``pewm-jax``: the table of commands, and their dispatch."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class Command:
     """A command.
 
     Attributes:
-        about: what it does, in one line.
-        settings: ``MODULE:NAME`` of the dataclass that it reads; or of a function that takes its
+        about: one-line description.
+        settings: ``MODULE:NAME`` of the dataclass of its settings; or of a function that takes its
             arguments and the words it was called by, and returns ``parser.Arguments``. The module
-            must be light: it is imported for ``--help``.
+            must import quickly: it is imported for ``--help``.
         run: ``MODULE:NAME`` of the function that takes the settings and returns an exit code; None
             is 0. Heavy modules are imported here.
     """
@@ -42,7 +42,7 @@ COMMANDS = {
         f"{CLI}.play:run",
     ),
     "demo": Command(
-        "collect, train, imagine and score, small and by one command",
+        "collect, train and evaluate a small model by one command",
         f"{CLI}.demo:Settings",
         f"{CLI}.demo:run",
     ),
@@ -72,17 +72,17 @@ COMMANDS = {
         f"{CLI}.train:run",
     ),
     "protocol": Command(
-        "choose the clips that runs are scored on, before training them",
+        "choose the clips of an evaluation, before training",
         f"{CLI}.evaluate:ProtocolSettings",
         f"{CLI}.evaluate:protocol",
     ),
     "evaluate": Command(
-        "score a trained run on held-out scenes and write a report",
+        "evaluate a trained run on held-out scenes and write a report",
         f"{CLI}.evaluate:EvaluateSettings",
         f"{CLI}.evaluate:evaluate",
     ),
     "compare": Command(
-        "compare two scored runs, with paired differences",
+        "compare two evaluated runs, with paired differences",
         f"{CLI}.evaluate:CompareSettings",
         f"{CLI}.evaluate:compare",
     ),
@@ -123,17 +123,17 @@ COMMANDS = {
         f"{CONVERT}.commands:import_dinov2",
     ),
     "convert import svd": Command(
-        "a checkpoint of Stable Video Diffusion → a world model steered by actions",
+        "a checkpoint of Stable Video Diffusion → a world model controlled by actions",
         f"{CONVERT}.options:ImportSVD",
         f"{CONVERT}.commands:import_svd",
     ),
     "convert import cosmos2": Command(
-        "a checkpoint of Cosmos-Predict2 for video → a world model steered by actions",
+        "a checkpoint of Cosmos-Predict2 for video → a world model controlled by actions",
         f"{CONVERT}.options:ImportCosmos2",
         f"{CONVERT}.commands:import_cosmos2",
     ),
     "convert export diffusers": Command(
-        "our CogVideoX weights, fine-tuned or not → a folder for from_pretrained",
+        "our CogVideoX weights, before or after fine-tuning → a folder for from_pretrained",
         f"{CONVERT}.options:ExportDiffusers",
         f"{CONVERT}.commands:export_diffusers",
     ),
@@ -148,7 +148,7 @@ COMMANDS = {
         f"{CONVERT}.commands:export_stablehlo",
     ),
     "plan": Command(
-        "print what a training would take on other hardware",
+        "predict memory and time of a training on other hardware",
         f"{CLI}.train:arguments",
         f"{CLI}.train:plan",
     ),
@@ -160,16 +160,16 @@ GROUPS = {
     "convert import": "read a checkpoint of another library",
     "convert export": "write weights for another program",
 }
-"""What the commands of a group do, in one line."""
+"""One-line descriptions of groups of commands."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0, 1 problems found, 2 bad input, 130 interrupted."""
+    """Run a command and return the exit code: 0, 1 problems found, 2 bad input, 130 interrupted."""
     return parser.run(execute, argv)
 
 
 def deprecated(group: str) -> int:
-    """Run a group of commands called as a module; returns the exit code."""
+    """Run a group of commands called as a module and return the exit code."""
     called = f"python -m pewm_jax.{group}"
     print(f"warning: `{called}` is deprecated; use `{PROGRAM} {group}`.", file=sys.stderr)
     return parser.run(lambda argv: execute([group, *argv], called))
@@ -180,7 +180,7 @@ def execute(argv: Sequence[str], called: str = "") -> int:
 
     Args:
         argv: the words of the command and its arguments.
-        called: what the user typed instead of ``pewm-jax`` and the first word.
+        called: the words typed instead of ``pewm-jax`` and the first word.
 
     Returns:
         The exit code.
@@ -197,12 +197,12 @@ def execute(argv: Sequence[str], called: str = "") -> int:
 
 
 def find(argv: Sequence[str]) -> tuple[str, list[str]]:
-    """Return the name of the command that the arguments begin with, and the other arguments.
+    """Return the name of the command at the start of the arguments, and the other arguments.
 
-    It is the name of a group where the arguments end or ask for help before a command is named.
+    It is the name of a group if the arguments end, or ask for help, before a command.
 
     Raises:
-        ConfigError: there is no such command; the message names the nearest one.
+        ConfigError: there is no such command; the message suggests the nearest one.
     """
     name, rest = "", list(argv)
     while name not in COMMANDS:
@@ -215,7 +215,7 @@ def find(argv: Sequence[str]) -> tuple[str, list[str]]:
 
 
 def below(group: str) -> dict[str, str]:
-    """Return the next words under a group ("" for all commands), with what each does."""
+    """Return the next words under a group ("" for all commands), with descriptions."""
     start = f"{group} " if group else ""
     found = {}
     for name, command in COMMANDS.items():
@@ -226,24 +226,24 @@ def below(group: str) -> dict[str, str]:
 
 
 def read(name: str, argv: Sequence[str], prog: str) -> list[Any]:
-    """Return what a command's function takes, read from its arguments."""
+    """Return the arguments of a command's function, parsed from the command line."""
     return list(parser.read(arguments_of(name, argv, prog), argv, prog).values())
 
 
 def arguments_of(name: str, argv: Sequence[str], prog: str) -> Arguments:
-    """Return what a command reads; see ``Command.settings``."""
+    """Return the arguments of a command; see ``Command.settings``."""
     found = function_of(COMMANDS[name].settings)
     return Arguments({"settings": (found, None)}) if isinstance(found, type) else found(argv, prog)
 
 
 def function_of(where: str) -> Callable[..., Any]:
-    """Import what ``MODULE:NAME`` names."""
+    """Import the object ``MODULE:NAME``."""
     module, _, name = where.partition(":")
     return getattr(importlib.import_module(module), name)
 
 
 def usage(group: str = "", called: str = "") -> str:
-    """Return the help of a group: a line for each command."""
+    """Return the help of a group: one line per command."""
     start = f"{group} " if group else ""
     names = [name.removeprefix(start) for name in COMMANDS if name.startswith(start)]
     found = {name: COMMANDS[start + name].about for name in names} if group else below("")
@@ -259,6 +259,6 @@ def usage(group: str = "", called: str = "") -> str:
 
 
 def _prog(name: str, called: str) -> str:
-    """Return the words that a command was called by."""
+    """Return the command as the user typed it."""
     rest = name.partition(" ")[2]
     return f"{called} {rest}".strip() if called else f"{PROGRAM} {name}".strip()

@@ -1,4 +1,4 @@
-"""Read the settings of a command from its arguments, with tyro; refuse them in one sentence.
+"""Read the settings of a command from its arguments, with tyro; errors are one sentence.
 
 The settings are dataclasses. Their fields are the flags, fields marked ``tyro.conf.Positional`` are
 the positional arguments, and docstrings are the help. Several dataclasses are composed, not copied:
@@ -34,15 +34,15 @@ from pewm_jax.errors import ConfigError, UserError, report
 
 T = TypeVar("T")
 Flat = Annotated[T, tyro.conf.arg(name="")]
-"""The type of a field whose own fields are flags without a prefix."""
+"""Type of a field whose own fields are flags without a prefix."""
 HELP = ("-h", "--help")
 _PLAIN = (
-    (r"invalid literal for int\(\) with base 10: (.*)", r"needs a whole number, got \1"),
+    (r"invalid literal for int\(\) with base 10: (.*)", r"needs an integer, got \1"),
     (r"could not convert string to float: (.*)", r"needs a number, got \1"),
     (r"(?s)no type matching (?:\{None\}\|)?\{?(.*?)\}? could be .* from (\[.*?\])\..*",
      r"needs \1, got \2"),
 )  # fmt: skip
-"""Messages of tyro, and what is said instead behind the flag's name."""
+"""Messages of tyro, and their replacements after the flag's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ class ConfigFile:
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """What a command takes.
+    """The arguments of a command.
 
     Attributes:
         groups: dataclasses whose fields become flags, each with its default; None for the default
@@ -74,15 +74,15 @@ class Arguments:
 
 
 def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
-    """Run a command; turn errors into an exit code and one sentence on stderr.
+    """Run a command; convert errors to an exit code and one sentence on stderr.
 
     Args:
         main: the command; takes the arguments and returns an exit code (None is 0).
         argv: the arguments, by default those of the process.
 
     Returns:
-        0; 2 for bad input and for files that cannot be used; 130, or the error's ``exit_code``,
-        for an interruption.
+        0; 2 for invalid input and unusable files; 130, or the error's ``exit_code``, for an
+        interruption.
     """
     try:
         return main(sys.argv[1:] if argv is None else argv) or 0
@@ -108,13 +108,13 @@ def parse(
         description: the first paragraph of the help text.
 
     Raises:
-        ConfigError: an unknown flag (with the nearest known one), or a value that is refused.
+        ConfigError: an unknown flag (with the nearest known one), or an invalid value.
     """
     return read(Arguments({"settings": (kind, default)}, description), argv, prog)["settings"]
 
 
 def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
-    """Read what a command takes; ``--help`` prints every flag with its docstring and exits.
+    """Parse a command's arguments; ``--help`` prints every flag with its docstring and exits.
 
     Args:
         wanted: the groups of settings.
@@ -125,8 +125,8 @@ def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
         The settings of each group, by its name.
 
     Raises:
-        ConfigError: an unknown flag (with the nearest known one), a value that is refused, or an
-            argument is missing.
+        ConfigError: an unknown flag (with the nearest known one), an invalid value, or a missing
+            argument.
     """
     flags = [wanted.renamed.get(word, word) for word in argv]
     groups = dict(wanted.groups)
@@ -148,7 +148,7 @@ def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
     known = [name for kind, default in everything.values() for name, _ in flags_of(default or kind)]
 
     if any(word in HELP for word in flags):
-        flags = ["--help"]  # in the place of a flag's value, too
+        flags = ["--help"]  # also in place of a flag's value
 
     def refuse(event: Any) -> None:
         raise ConfigError(_sentence(event, known, hint))
@@ -179,9 +179,9 @@ def _composed(groups: Mapping[str, tuple[type, Any]]) -> type:
 
 
 def _on_parse_error(refuse: Callable[[Any], None]) -> contextlib.AbstractContextManager[Any]:
-    """Call a function with each error as tyro found it.
+    """Call a function with each error found by tyro.
 
-    This hook of tyro is private. Versions without it print a message of their own and exit with 2.
+    This hook of tyro is private. Versions without it print their own message and exit with 2.
     """
     try:
         from tyro._errors import on_parse_error
@@ -209,7 +209,7 @@ def _sentence(event: Any, known: Sequence[str], hint: str) -> str:
 
 
 def _refused(message: str, where: str, hint: str) -> str:
-    """Return a sentence about a value that a type or the settings refuse."""
+    """Return a sentence about an invalid value."""
     text = re.sub(r"\[/?\w+\]", "", message).strip()
     for pattern, plain in _PLAIN if where else ():
         text, count = re.subn(pattern, plain, text)
@@ -223,7 +223,7 @@ def _refused(message: str, where: str, hint: str) -> str:
 
 
 def _missing(arguments: Sequence[Any], hint: str) -> str:
-    """Return a sentence about arguments that are required."""
+    """Return a sentence about missing arguments."""
     if len(arguments) > 1:
         return f"{' and '.join(map(_name_of, arguments))} are missing; see `{hint} --help`."
     text = arguments[0].field.helptext
@@ -232,16 +232,16 @@ def _missing(arguments: Sequence[Any], hint: str) -> str:
 
 
 def _unknown(tokens: Sequence[str], known: Sequence[str], hint: str) -> str:
-    """Return a sentence about arguments that nothing reads."""
+    """Return a sentence about unknown arguments."""
     if not tokens[0].startswith("--"):
-        return f"There is no place for {tokens[0]}; `{hint} --help` lists the settings."
+        return f"{tokens[0]} is an unexpected argument; `{hint} --help` lists the settings."
     flag = tokens[0].split("=")[0]
     name = "--" + flag[2:].replace("-", "_")
     return f"{flag} is not a setting{_nearest(name, known)}; `{hint} --help` lists them all."
 
 
 def _name_of(argument: Any) -> str:
-    """Return how messages name an argument: its flag, or the name of a position in capitals."""
+    """Return an argument's name in messages: its flag, or its position's name in capitals."""
     if argument.is_positional():
         shown = str(argument.lowered.metavar)
         name = argument.field.intern_name.rpartition(".")[2].upper()
@@ -250,7 +250,7 @@ def _name_of(argument: Any) -> str:
 
 
 def _joined(flags: Sequence[str], name: str) -> list[str]:
-    """Let a flag of many values be given many times: ``--p a --p b`` becomes ``--p a b``."""
+    """Join repeated flags with several values: ``--p a --p b`` becomes ``--p a b``."""
     values: list[str] = []
     rest: list[str] = []
     into = rest
@@ -266,7 +266,7 @@ def _joined(flags: Sequence[str], name: str) -> list[str]:
 
 
 def _take_config_file(flags: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """Take ``--config FILE`` out of the arguments."""
+    """Remove ``--config FILE`` from the arguments."""
     for index, flag in enumerate(flags):
         if flag.startswith("--config="):
             return Path(flag.removeprefix("--config=")), [*flags[:index], *flags[index + 1 :]]
@@ -278,11 +278,11 @@ def _take_config_file(flags: Sequence[str]) -> tuple[Path | None, list[str]]:
 
 
 def optional(kind: type, *names: str) -> type:
-    """Return a dataclass of fields of another one, each None unless it is given.
+    """Return a dataclass with fields of another one, each None by default.
 
     Args:
         kind: the dataclass; its types and docstrings are those of the flags.
-        names: of the fields, in the order of the help.
+        names: names of the fields, in the order of the help.
     """
     hints = typing.get_type_hints(kind, include_extras=True)
     texts = _field_docs(kind)
@@ -317,12 +317,12 @@ def choose(name: str, known: Sequence[str], what: str) -> str:
     """Return ``name`` if it is known.
 
     Raises:
-        ConfigError: it is not known; the message lists the known names, and the nearest first.
+        ConfigError: it is unknown; the message lists the known names and suggests the nearest.
     """
     if name in known:
         return name
     raise ConfigError(
-        f"There is no {what} {name!r}{_nearest(name, known)}; there is {', '.join(known)}."
+        f"There is no {what} {name!r}{_nearest(name, known)}; known: {', '.join(known)}."
     )
 
 

@@ -21,15 +21,15 @@ from pewm_jax.play.settings import Serve, Start
 class Settings(Start, Serve):
     """Drive through a world that a model imagines, in the browser.
 
-    W, A, S, D or the arrows drive; the page has the map in 3D, with boxes to erase and move. The
-    drive begins in a generated house, unless a mesh, an episode or a recording is named. Ctrl-C
+    W, A, S, D or the arrow keys drive; the page shows the map in 3D, with boxes to erase and move.
+    The drive starts in a generated house, unless a mesh, an episode or a recording is given. Ctrl-C
     ends it.
     """
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = dataclasses.field(
         kw_only=True
     )
-    """A run's folder, an export, or the name of a model that comes with the library."""
+    """A run's folder, an export, or the name of a model that ships with the library."""
 
     def __post_init__(self):
         """Validate."""
@@ -42,10 +42,10 @@ def run(settings: Settings) -> None:
     model = settings.model
     if not (shipped.find(model) / "config.json").is_file():
         raise ConfigError(
-            f"{model} is no run: name its folder, such as runs/demo, or one of "
+            f"{model} is not a run: give the folder of a run, such as runs/demo, or one of "
             f"{', '.join(shipped.names())}."
         )
-    # Imported here and not above: help and refusals are fast, and malloc is set up first.
+    # Imported lazily: help and errors are fast, and malloc is set up first.
     runtime.keep_small()
     print("Starting …", flush=True)
     from pewm_jax.play import page as pages
@@ -68,9 +68,9 @@ def run(settings: Settings) -> None:
 
 
 def _require_usable(name: str, start: Start, worlds: Path | None) -> None:
-    """Refuse, before the page opens, what cannot be loaded, begun with or written.
+    """Raise errors before the page opens: missing model, unusable start, unwritable folder.
 
-    Weights are mapped and not read.
+    Weights are memory-mapped and not read.
     """
     from pewm_jax import config as configuration
     from pewm_jax.play import places
@@ -86,13 +86,12 @@ def _require_usable(name: str, start: Start, worlds: Path | None) -> None:
         there = next(path for path in (worlds, *worlds.absolute().parents) if path.exists())
         if not there.is_dir() or not os.access(there, os.W_OK):
             raise ConfigError(
-                f"--worlds is {worlds}, and {there} is no folder that can be written: choose "
-                "another one."
+                f"--worlds is {worlds}, but {there} is not a writable folder: choose another one."
             )
 
 
 def _load(name: str, home: Path):
-    """Load the model, and keep what is compiled for it."""
+    """Load the model, and enable the compilation cache."""
     from pewm_jax.play.engine import open_engine
     from pewm_jax.train.loading import load
 

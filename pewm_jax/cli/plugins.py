@@ -14,17 +14,17 @@ from pewm_jax.config import ConfigError
 
 @dataclasses.dataclass(frozen=True)
 class Plugins:
-    """Code of the user's own that runs before settings are read; every command takes it."""
+    """User code that runs before settings are read; a flag of every command."""
 
     plugin: tuple[Path, ...] = ()
-    """FILE.py: run this Python file first; it registers worlds or parts of your own. May be
+    """FILE.py: run this Python file first; it registers your own worlds or parts. May be
     repeated."""
 
 
 def take(argv: Sequence[str]) -> list[str]:
-    """Import the files that ``--plugin`` names, and the modules of the deprecated ``--import``.
+    """Import the files given by ``--plugin``, and the modules given by the deprecated ``--import``.
 
-    Modules are looked for in the current folder too, after all others.
+    Modules are also looked up in the current folder, after all other locations.
 
     Args:
         argv: the arguments; the flags may be repeated.
@@ -33,7 +33,7 @@ def take(argv: Sequence[str]) -> list[str]:
         The other arguments.
 
     Raises:
-        ConfigError: a flag without its value, or a file or module that cannot be imported.
+        ConfigError: a flag has no value, or a file or module cannot be imported.
     """
     rest, queue = [], list(argv)
     while queue:
@@ -60,7 +60,7 @@ def take(argv: Sequence[str]) -> list[str]:
 
 
 def load_file(name: str) -> None:
-    """Import a Python file; its module is called as the file is.
+    """Import a Python file; its module has the file's name.
 
     Raises:
         ConfigError: there is no such file, or it cannot be imported.
@@ -84,7 +84,7 @@ def load_file(name: str) -> None:
 
 
 def look_here() -> None:
-    """Let modules be found in the current folder too, after all others."""
+    """Add the current folder to the end of the module search path."""
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)

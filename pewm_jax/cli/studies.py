@@ -15,11 +15,11 @@ from pewm_jax.io import runtime
 
 @dataclasses.dataclass(frozen=True)
 class Table1Settings:
-    """Train and score every memory with every reader that applies: the paper's Table 1.
+    """Train and evaluate every memory with every applicable reader: the paper's Table 1.
 
-    All start from the same backbones and train for equal time; all are scored on the same held-out
-    clips. Writes a table (Markdown, LaTeX, CSV) and a plot. If interrupted, run it again: it
-    resumes. More seeds are added to the existing results.
+    All start from the same backbones and train for equal time; all are evaluated on the same
+    held-out clips. Writes a table (Markdown, LaTeX, CSV) and a plot. If interrupted, run it again:
+    it resumes. More seeds are added to the existing results.
     """
 
     out: Path = Path("runs/table1")
@@ -29,28 +29,28 @@ class Table1Settings:
     preset: str = "table1"
     """Settings that all rows share; its memory is the paper's map."""
     minutes: tuple[float, float] = (8.0, 6.0)
-    """Processor minutes of training steps: of the backbone of each seed, and of each row."""
+    """Processor minutes of training steps: for the backbone of each seed, and for each row."""
     steps: tuple[int, int] | None = None
-    """Numbers of steps instead: equal steps, and not equal time."""
+    """Numbers of steps instead: equal steps instead of equal time."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Training seeds."""
     rows: tuple[str, ...] = ()
     """Only these rows, such as --rows none voxel-attend."""
     ablate: Literal["cell", "extent", "tokens", "features", "time"] | None = None
-    """Instead of the table vary a setting of the voxel map that attention reads: side of a cell on
-    the ground, m; side of the map, m; tokens that condition a clip; what a cell holds (colours,
-    latents, points, or dinov2=FOLDER of `convert import dinov2`); or train the paper's own form
-    longer (times the others' time)."""
+    """Vary a setting of the voxel map read by attention instead: side of a cell on the ground, m;
+    side of the map, m; tokens that condition a clip; content of a cell (colours, latents, points,
+    or dinov2=FOLDER of `convert import dinov2`); or train the paper's own form longer (multiples of
+    the others' time)."""
     values: tuple[str, ...] = ()
-    """Values to try in the place of the ablation's own."""
+    """Values to try instead of the ablation's own."""
     clips: int | None = None
-    """Held-out clips; by default the preset's."""
+    """Number of held-out clips; by default the preset's."""
     dreamsim: Path | None = None
-    """Folder with the weights of DreamSim 0.2 (ensemble), which no package has."""
+    """Folder with the weights of DreamSim 0.2 (ensemble), which ship with no package."""
 
 
 def table1(settings: Table1Settings) -> None:
-    """Make the table and print its path."""
+    """Write the table and print its path."""
     config = presets.load(parser.choose(settings.preset, presets.names(), "preset"))
     if settings.data is not None:
         data = dataclasses.replace(config.data, path=str(settings.data))
@@ -59,7 +59,7 @@ def table1(settings: Table1Settings) -> None:
         evaluate = dataclasses.replace(config.evaluate, clips=settings.clips)
         config = dataclasses.replace(config, evaluate=evaluate)
     runtime.keep_large()
-    # Imported here and not above: help and refusals are fast.
+    # Imported lazily: help and errors are fast.
     from pewm_jax.studies import table1 as study
 
     runtime.cache_compilation(settings.out)
@@ -81,58 +81,58 @@ def table1(settings: Table1Settings) -> None:
 class Table2Settings:
     """Decide tasks in held-out houses by policies, rankings and plans: the paper's Table 2.
 
-    All decide the same tasks: a policy alone, its proposals ranked by a world model, one plan (open
-    loop) and plans in a closed loop (MPC). Each uses an empty memory, reprojection without a
+    All methods get the same tasks: a policy alone, its proposals ranked by a world model, one plan
+    (open loop) and plans in a closed loop (MPC). Each uses an empty memory, reprojection without a
     network, the memory, or the renderer itself as the model. Writes a table, a plot and videos.
     If interrupted, run it again: it resumes.
     """
 
     model: str = "small"
-    """A run's folder, or a model that comes with the library."""
+    """A run's folder, or a model that ships with the library."""
     out: Path = Path("runs/table2")
     """Folder of the results."""
     tasks: int = 48
-    """Tasks, spread evenly over the houses."""
+    """Number of tasks, spread evenly over the houses."""
     houses: int = 24
-    """Held-out houses."""
+    """Number of held-out houses."""
     proposals: tuple[int, ...] = (8, 16)
     """Numbers of a policy's proposals that are ranked."""
     candidates: int = 60
-    """Candidates of a round of planning."""
+    """Candidates per round of planning."""
     elites: int = 18
-    """The best of them, which the next round is drawn from."""
+    """Number of best candidates to which the next round is fitted."""
     rounds: int = 12
-    """Rounds of planning."""
+    """Number of rounds of planning."""
     horizon: int = 8
-    """Actions of the shortest walk to a goal, a multiple of what the model imagines at once."""
+    """Number of actions of the shortest walk to a goal, a multiple of the model's clip length."""
     multiples: tuple[int, ...] = (1, 2, 3)
     """Distances of goals and lengths of plans, in multiples of --horizon."""
     none: str = ""
     """A run that was trained without memory (`pewm-jax train small --train.stage2.steps 0
-    --train.joint.steps 0 --train.gate.steps 0 …`), which gets rows of its own."""
+    --train.joint.steps 0 --train.gate.steps 0 …`), which gets its own rows."""
     policy: str = "wander"
     """`wander` (random walks), the folder of a trained NoMaD (`runs/nomad`), or
     MODULE:FUNCTION, see `studies.deciders.Policy`."""
     cost: Literal["lpips", "pixels"] = "lpips"
-    """How far the last frame is from the goal's picture."""
+    """Distance of the last frame from the goal image."""
     videos: int = 3
-    """Tasks of which a video shows the plan next to the real frames."""
+    """Number of tasks with a video of the plan next to the real frames."""
 
 
 def table2(settings: Table2Settings) -> None:
-    """Make the table and print its path."""
+    """Write the table and print its path."""
     for name in ("tasks", "houses", "videos"):
         if getattr(settings, name) < (name != "videos"):
             raise ConfigError(f"--{name} is {getattr(settings, name)}: give at least 1.")
     counts = settings.proposals
     if not counts or min(counts) < 1 or len(set(counts)) < len(counts):
         raise ConfigError(
-            "--proposals needs different numbers from 1 on, such as --proposals 8 16."
+            "--proposals needs distinct numbers of 1 or more, such as --proposals 8 16."
         )
     far = settings.multiples
     if not far or far[0] != 1 or min(far) < 1 or list(far) != sorted(set(far)):
-        raise ConfigError("--multiples needs growing numbers from 1 on, such as 1 2 3.")
-    # Imported here and not above: help and refusals are fast.
+        raise ConfigError("--multiples needs increasing numbers of 1 or more, such as 1 2 3.")
+    # Imported lazily: help and errors are fast.
     from pewm_jax.planning import costs
     from pewm_jax.planning.settings import PlanConfig
     from pewm_jax.studies import table2 as study
@@ -154,7 +154,7 @@ def table2(settings: Table2Settings) -> None:
 
 
 def _policy(name: str) -> tuple[str, Callable[..., Any]]:
-    """Return the name under which decisions of a policy are stored, and the policy."""
+    """Return the name for a policy's stored decisions, and the policy."""
     from pewm_jax.studies import deciders
 
     if name in deciders.POLICIES:
@@ -178,29 +178,29 @@ def _policy(name: str) -> tuple[str, Callable[..., Any]]:
 
 @dataclasses.dataclass(frozen=True)
 class PracticeSettings:
-    """Train a policy (NoMaD) in imagination in held-out houses of which it has few pictures.
+    """Train a policy (NoMaD) in imagination, from a few images of held-out houses.
 
-    It practises in the world that these pictures start, with its memory and without, and in the
-    house itself, and is then sent to goals there. Writes a table and a picture. If interrupted, run
+    It practises in the world started from these images, with its memory and without, and in the
+    house itself, and is then sent to goals there. Writes a table and an image. If interrupted, run
     it again: it resumes.
     """
 
     policy: Path = Path("runs/nomad")
     """The run of a NoMaD (pewm-jax train nomad)."""
     model: str = "small"
-    """A run's folder, or a model that comes with the library."""
+    """A run's folder, or a model that ships with the library."""
     out: Path = Path("runs/practice")
     """Folder of the results."""
     houses: int = 12
-    """Held-out houses."""
+    """Number of held-out houses."""
     tasks: int = 12
-    """Goals in each house."""
+    """Number of goals in each house."""
     walks: int = 32
-    """Walks of a practice."""
+    """Number of walks per practice."""
     blocks: int = 4
-    """Proposals that are carried out in a walk, one after the other."""
+    """Number of consecutive proposals executed in a walk."""
     steps: int = 150
-    """Steps of training on the walks."""
+    """Number of training steps on the walks."""
     learning_rate: float = 2e-4
     """Learning rate of that training."""
     seeds: tuple[int, ...] = (0,)
@@ -209,7 +209,7 @@ class PracticeSettings:
 
 def practice(settings: PracticeSettings) -> None:
     """Run the study and print the path of its table."""
-    # Imported here and not above: help and refusals are fast.
+    # Imported lazily: help and errors are fast.
     from pewm_jax.planning.practice import Practice
     from pewm_jax.studies import practice as study
     from pewm_jax.studies.practice_piece import PracticeConfig

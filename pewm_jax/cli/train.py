@@ -30,23 +30,24 @@ EXAMPLES = {
 }
 ABOUT = {
     "train": "Train a world model. The same command resumes an interrupted training.",
-    "plan": "Print what a training would take on other hardware. Nothing is trained or written.",
+    "plan": "Predict memory and time of a training on other hardware. Nothing is trained or "
+    "written.",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class Chosen:
-    """What is trained, and how it is launched."""
+    """The preset, and how it is launched."""
 
     preset: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PRESET")]
-    """A preset; the name of a world that a plugin registers; or a folder made by `pewm-jax convert
-    import`, whose settings and weights training starts from."""
+    """A preset; the name of a world registered by a plugin; or a folder made by `pewm-jax convert
+    import`, whose settings and weights are the start of training."""
     launch: Flat[Launch] = LAUNCH
     """How it is launched."""
 
 
 def arguments(argv: Sequence[str], prog: str) -> Arguments:
-    """Return what ``train`` and ``plan`` read: the settings depend on the preset.
+    """Return the arguments of ``train`` and ``plan``; the settings depend on the preset.
 
     Raises:
         ConfigError: the arguments name no preset.
@@ -57,7 +58,7 @@ def arguments(argv: Sequence[str], prog: str) -> Arguments:
     if argv and argv[0] in parser.HELP:
         return Arguments(chosen, ABOUT[command], _epilog(prog, EXAMPLES[command]))
     if not argv or argv[0].startswith("-"):
-        raise ConfigError(f"Name a preset first: {prog} demo ({', '.join(known)}).")
+        raise ConfigError(f"Give a preset first: {prog} demo ({', '.join(known)}).")
     name, folder = argv[0], Path(argv[0])
     if name not in known and (folder / "config.json").is_file():
         default, about = _settings_in(folder), f"The settings in {folder}."
@@ -79,7 +80,7 @@ def run(chosen: Chosen, config: Config) -> None:
         plan(chosen, config)
         return
     runtime.keep_large()
-    # Imported here and not above: help and refusals are fast, and Ctrl-C is clean meanwhile.
+    # Imported lazily: help and errors are fast, and Ctrl-C is clean meanwhile.
     from pewm_jax.train import processes
 
     with processes.joined(launch):
@@ -89,7 +90,7 @@ def run(chosen: Chosen, config: Config) -> None:
         from pewm_jax.train import loop
 
         if isinstance(config.model, World):
-            protocols.apply_protocol_file(config, {})  # refused now, and not after the training
+            protocols.apply_protocol_file(config, {})  # fail before training
         folder = loop.runs.check(config)
         runtime.cache_compilation(folder.parent)
         preview = pictures.make_preview(config, folder) if config.train.preview_every else None
@@ -97,7 +98,7 @@ def run(chosen: Chosen, config: Config) -> None:
 
 
 def plan(chosen: Chosen, config: Config) -> None:
-    """Print what a training would take on other hardware."""
+    """Print the predicted memory and time of a training on other hardware."""
     from pewm_jax.plan import plan as planning
 
     planning.show(config, dataclasses.replace(chosen.launch, plan=True))
@@ -107,14 +108,14 @@ def _epilog(prog: str, examples: Sequence[str]) -> str:
     """Return the list of presets, and examples."""
     lines = [f"  {name:<12} {presets.describe(name)}" for name in presets.names()]
     called = [f"  {prog} {example}" for example in examples]
-    more = f"`{prog} PRESET --help` lists every setting with its meaning and its value there."
+    more = f"`{prog} PRESET --help` lists every setting with its meaning and its value."
     return "\n".join(["Presets:", *lines, "", "Examples:", *called, "", more])
 
 
 def _settings_in(folder: Path) -> Config:
-    """Return the settings in a folder of weights, to start from those weights.
+    """Return the settings in a folder of weights, for training from those weights.
 
-    A run's own folder starts from what it started from: the same command resumes it.
+    A run's own folder keeps its original start weights: the same command resumes it.
     """
     config = configuration.load(folder / "config.json")
     if Path(config.train.run).resolve() == folder.resolve():

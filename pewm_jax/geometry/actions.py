@@ -95,11 +95,11 @@ def compose(actions_S3: np.ndarray) -> np.ndarray:
     """Compose consecutive planar actions into single ones.
 
     Args:
-        actions_S3: (..., S, 3) planar actions, carried out one after the other.
+        actions_S3: (..., S, 3) planar actions, in sequence.
 
     Returns:
-        (..., 3) float32: where the agent ends, seen from where it began, and the sum of its turns
-        (not wrapped: a full circle is 2π).
+        (..., 3) float32: the final position in the initial frame, and the sum of the turns (not
+        wrapped: a full circle is 2π).
     """
     moves = np.asarray(actions_S3, np.float64)
     dx, dy, turn = moves[..., 0], moves[..., 1], moves[..., 2]
@@ -125,8 +125,7 @@ def there_and_back(actions_T3: Array) -> Array:
     Args:
         actions_T3: (..., T, 3) planar actions.
 
-    Returns:
-        (..., 2 T, 3): after k of them the agent is where it is after 2 T − k.
+    (..., 2 T, 3): the pose after k actions equals the pose after 2 T − k.
     """
     out = jnp.asarray(actions_T3)
     turn = -out[..., 2:]

@@ -11,11 +11,11 @@ import numpy as np
 from pewm_jax.types import Array
 
 SIDES = (0.88, 0.74, 1.0, 0.5)
-"""Light on sides perpendicular to x, y and z, and on the cell in which a ray begins."""
+"""Light on sides perpendicular to x, y and z, and on the cell in which a ray starts."""
 BELOW = 0.62
-"""Light on a side that is seen from below, such as a ceiling."""
+"""Light on a side seen from below, such as a ceiling."""
 HALF_M = 7.0
-"""Distance at which light falls to a half, metres."""
+"""Distance at which light falls to one half, metres."""
 CORNER, CORNER_M = 0.35, 0.2
 """Darkening in a corner, and the distance from the corner at which it ends, metres."""
 
@@ -38,7 +38,7 @@ def light(
         eye_3: origin of the rays, metres.
         way_HW3: (H, W, 3) directions of the rays.
         far_HW: distance from the origin to the hit cell, in lengths of the direction.
-        side_HW: axis (0, 1, 2) across which the ray enters the cell; −1 where it begins inside.
+        side_HW: axis (0, 1, 2) across which the ray enters the cell; −1 if it starts inside.
     """
     facing = jnp.asarray(SIDES, jnp.float32)[side_HW]
     facing = jnp.where((side_HW == 2) & (way_HW3[..., 2] > 0), BELOW, facing)
@@ -49,7 +49,7 @@ def light(
 
 
 def side_of(at_HW3: Array) -> Array:
-    """Return the (H, W) axis of the cell border that is nearest to points on the sides of cells.
+    """Return the (H, W) axis of the cell border nearest to points on the sides of cells.
 
     Args:
         at_HW3: points, in cells from the grid's lowest corner.

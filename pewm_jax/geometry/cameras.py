@@ -152,7 +152,7 @@ def project(points_world_P3: Array, camera: Camera) -> tuple[Array, Array]:
 
 
 def require_array(who: str, name: str, value: Any, *shape: Any) -> None:
-    """Refuse an argument that is not an array of finite numbers of a shape.
+    """Raise an error for an argument that is not an array of finite numbers of a given shape.
 
     Under jit, vmap and grad only types and shapes are checked, not values.
 
@@ -164,7 +164,7 @@ def require_array(who: str, name: str, value: Any, *shape: Any) -> None:
             may come before them.
 
     Raises:
-        UserError: it has another type or shape, or holds NaN or infinity.
+        UserError: it has another type or shape, or contains NaN or infinity.
     """
     free, sizes = shape[:1] == (...,), tuple(n for n in shape if n is not ...)
     if isinstance(value, Tracer):

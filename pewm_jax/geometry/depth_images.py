@@ -1,7 +1,7 @@
 """Depth images: filling their holes, and the normals of the surfaces they show.
 
-Holes are filled from the nearest known pixel, which jump flooding finds (steps of …, 4, 2, 1 and
-once more 1 pixels): the number of passes is static, and in rare cases the pixel found is a little
+Holes are filled from the nearest known pixel, found by jump flooding (steps of …, 4, 2, 1 and once
+more 1 pixels): the number of passes is static, and in rare cases the found pixel is slightly
 farther away than the nearest.
 """
 
@@ -52,7 +52,7 @@ def nearest_known(known_THW: Array) -> tuple[Array, Array]:
         return found, None
 
     def one(known_HW: Array) -> Array:
-        # A scan: unrolled passes would be fused and recomputed by each of their readers.
+        # Use a scan: unrolled passes would be fused and recomputed by each of their consumers.
         return jax.lax.scan(flood, jnp.where(known_HW, place, -1), jnp.array(steps))[0]
 
     source = jax.vmap(one)(jnp.asarray(known_THW)).reshape(frames, -1)
@@ -62,7 +62,7 @@ def nearest_known(known_THW: Array) -> tuple[Array, Array]:
 def fill_depth(depth_THW: Array, otherwise: float) -> Array:
     """Return depths whose holes have the depth of the nearest measured pixel.
 
-    Images without holes are returned as they are, without any work.
+    Images without holes are returned unchanged, at no cost.
 
     Args:
         depth_THW: (T, H, W) metres, 0 where not measured.

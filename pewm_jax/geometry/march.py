@@ -1,8 +1,8 @@
 """Cast rays through a grid of class ids: the occupied cells along each ray, in order.
 
-A ray goes from cell to cell (Amanatides and Woo 1987, "A fast voxel traversal algorithm"). The next
-border is computed from the cell's index and not by accumulation, so rounding errors do not grow
-along the ray. PERSIST's renderer (arXiv 2603.03482) uses such layers of faces for each pixel.
+A ray steps from cell to cell (Amanatides and Woo 1987, "A fast voxel traversal algorithm"). The
+next border is computed from the cell's index instead of by accumulation, so rounding errors do not
+grow along the ray. PERSIST's renderer (arXiv 2603.03482) uses such layers of faces for each pixel.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from pewm_jax.geometry.cameras import einsum
 from pewm_jax.types import Array, Camera
 
 SIDES, SHIFT, INSIDE = 4, 2, 3
-"""Number of sides of a cell (one per axis, or the ray begins inside), their bits, and INSIDE."""
+"""Number of sides of a cell (one per axis, or the ray starts inside), their bits, and INSIDE."""
 EMPTY = 0
 """The class id of an empty cell."""
 CHUNK = 4096
-"""Rays processed at a time, so that their state fits in a processor's cache."""
+"""Rays processed at a time, so that their state fits in a CPU cache."""
 ROUND = 32
 """Cells of a ray looked up at a time: the bits of a word."""
 
@@ -35,7 +35,7 @@ class RayHits:
     Attributes:
         ids_L: (..., L) int32 class ids, ``EMPTY`` in empty slots.
         distance_L: (..., L) distance at which the ray enters the cell, in lengths of its direction;
-            0 in empty slots and where the ray begins inside the cell.
+            0 in empty slots and where the ray starts inside the cell.
         side_L: (..., L) int32 axis (0, 1, 2) across which the ray enters; −1 where the distance is
             0 for these reasons.
     """
@@ -61,7 +61,7 @@ def march(
         cell_m: side of a cell, metres.
         origins_R3: (R, 3) origins of the rays, inside or outside the grid, metres.
         directions_R3: (R, 3) directions of the rays, of any length above 0.
-        layers: L; cells beyond the first L are left out.
+        layers: L; cells after the first L are dropped.
 
     Returns:
         (R, L).
@@ -84,7 +84,7 @@ def march(
 
 
 def _require_bits(shape: tuple[int, ...]) -> None:
-    """Refuse grids whose cells cannot be packed into 32 bits."""
+    """Raise an error for grids whose cells cannot be packed into 32 bits."""
     if SHIFT + sum((count + 1).bit_length() for count in shape) > 32:
         raise UserError(f"the grid has {shape} cells; rays can cross at most 1022 along each axis.")
 
@@ -236,7 +236,7 @@ class _PackedCells:
         return x | y | z | side.astype(jnp.uint32)
 
     def turns(self, ahead: Array) -> list[Array]:
-        """Return what a step of −1 or 1 along each axis adds to a packed cell without a side."""
+        """Return the increment of a packed cell for a step of −1 or 1 along each axis."""
         return [
             (step << shift).astype(jnp.uint32) + jnp.uint32(axis)
             for axis, (step, shift) in enumerate(zip(ahead, self.shifts, strict=True))

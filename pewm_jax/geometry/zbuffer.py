@@ -1,12 +1,12 @@
 """Z-buffers of points that have a size: the nearest point at each pixel, and the visible points.
 
-All shapes are static and all results deterministic: of equally near points the first wins.
+All shapes are static and all results deterministic: among equally near points the first wins.
 
-``visible_first`` chooses the points that condition a clip. Each camera draws the points into a
-small z-buffer, in their sizes; every pixel names the point it shows. Points named by most pixels
-come first, as they stand for the largest part of the frames to imagine. Ties are broken by
-``pixel_order``, which goes round all bins of the image so that no part of it is starved. Then come
-points on a surface that is seen, then those hidden in view, then all others.
+``visible_first`` chooses the points that condition a clip. Each camera renders the points, with
+their sizes, into a small z-buffer; every pixel votes for the point it shows. Points with the most
+pixels come first, because they cover the largest part of the frames to imagine. Ties are broken by
+``pixel_order``, which cycles through all bins of the image so that no part of it is starved. Then
+come points on a visible surface, then occluded points in view, then all others.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def _spread(depth: Array, index: Array, axis: int) -> tuple[Array, Array]:
         next_one = moved(best[0], jnp.inf), moved(best[1], np.iinfo(np.int32).max)
         return nearer(nearer(best, next_one), level), None
 
-    # A scan: unrolled levels would be fused and recomputed by each of their readers.
+    # Use a scan: unrolled levels would be fused and recomputed by each of their consumers.
     smaller = depth[:-1], index[:-1]
     return jax.lax.scan(step, (depth[-1], index[-1]), smaller, reverse=True)[0]
 

@@ -16,7 +16,7 @@ from pewm_jax.houses.shell import doorway_piece, level_mesh, trim_piece, wall_me
 from pewm_jax.houses.textures import hsv, shade
 
 _STREAM = 0x50457
-"""Separates the generator's random numbers from other uses of the same seed."""
+"""Seed offset that separates the generator's random numbers from other uses of the same seed."""
 _WALLS = ("plaster", "stripes", "wainscot", "diamonds", "band", "plaster")
 _FLOORS = {
     "kitchen": ("checks", "tiles"),
@@ -35,7 +35,7 @@ def generate_house(seed: int) -> trimesh.Scene:
         seed: any non-negative integer; the same seed gives the same house in every process.
 
     Returns:
-        A scene whose metadata holds ``name``, ``seed``, ``shading`` ("soft": light is to be
+        A scene whose metadata contains ``name``, ``seed``, ``shading`` ("soft": light is to be
         baked), ``rooms`` ([x0, y0, x1, y1] per room, metres), ``uses`` (one word per room) and
         ``doorways`` ([room, room, x0, y0, x1, y1]).
     """

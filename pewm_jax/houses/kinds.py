@@ -1,11 +1,11 @@
-"""Kinds of things in a house, derived from the names that the generator gives its parts."""
+"""Kinds of objects in a house, derived from the names that the generator gives its parts."""
 
 from __future__ import annotations
 
 import re
 
 OTHER = "other"
-"""The kind of parts whose name tells nothing, such as those of a user's mesh."""
+"""The kind of parts whose name is not informative, such as those of a user's mesh."""
 SHELL = ("wall", "floor", "ceiling", "trim", "doorway", "window")
 MOVING = ("door", "robot")
 FURNITURE = (

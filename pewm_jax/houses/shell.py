@@ -19,7 +19,7 @@ TILE_M = 2.0
 
 
 def _cuts(low: float, high: float, marks: list[float]) -> np.ndarray:
-    """Return coordinates from low to high through the marks, nowhere farther apart than GRID_M."""
+    """Return coordinates from low to high that include the marks, at most GRID_M apart."""
     edges = sorted({low, high, *(m for m in marks if low < m < high)})
     parts = [
         np.linspace(a, b, max(1, int(np.ceil((b - a) / GRID_M))) + 1)[:-1]

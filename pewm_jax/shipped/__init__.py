@@ -1,6 +1,6 @@
-"""Weights that come with the library, by name; they need no network.
+"""Weights that ship with the library, by name; they need no network access.
 
-Each is a folder here, as ``pewm-jax convert export inference`` makes it: ``config.json``,
+Each is a folder here, in the format of ``pewm-jax convert export inference``: ``config.json``,
 ``weights.safetensors`` in 16 bits, and ``README.md``, its card. ``pewm_jax.load("codec")`` and
 ``train.start codec`` find them.
 """
@@ -13,15 +13,15 @@ HERE = Path(__file__).parent
 
 
 def names() -> list[str]:
-    """Return the names of all that is here."""
+    """Return the names of all shipped weights."""
     return sorted(path.parent.name for path in HERE.glob("*/weights.safetensors"))
 
 
 def find(path: str | Path) -> Path:
-    """Return the folder that a path or a name stands for.
+    """Return the folder of a path or a name.
 
     Args:
-        path: a folder, which is returned as it is if it exists, or a name in ``names()``.
+        path: a folder, returned unchanged if it exists, or a name in ``names()``.
     """
     folder = Path(path)
     if not folder.exists() and str(path) in names():
@@ -30,6 +30,6 @@ def find(path: str | Path) -> Path:
 
 
 def home(path: str | Path) -> Path:
-    """Return where reports of weights go: beside them, or to ``runs/NAME`` if they came along."""
+    """Return the folder for reports: beside the weights, or ``runs/NAME`` for shipped ones."""
     folder = find(path)
     return Path("runs") / folder.name if folder.parent == HERE else folder

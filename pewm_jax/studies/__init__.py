@@ -1,6 +1,6 @@
-"""Studies that combine many trainings or decisions; each is one command that can be resumed.
+"""Studies that combine many trainings or decisions; each is one resumable command.
 
-``table1`` trains and scores all memories, as the paper's Table 1 does. ``table2`` measures whether
-a world model helps to decide, and what its memory adds. ``practice`` measures what a policy learns
-by practice in imagination.
+``table1`` trains and evaluates all memories, as in the paper's Table 1. ``table2`` measures whether
+a world model improves decisions, and what its memory adds. ``practice`` measures what a policy
+learns by practice in imagination.
 """

@@ -3,14 +3,14 @@
 All but the first need a predictor of future observations:
 
 * ``empty``: the model with an empty memory;
-* ``none``: a model that was trained without memory, if there is one;
-* ``reproject``: no network, observed pixels moved to the future camera;
+* ``none``: a model trained without memory (optional);
+* ``reproject``: no network, observed pixels reprojected to the future camera;
 * ``memory``: the model with its memory;
 * ``truth``: the renderer itself, an upper bound of any model.
 
 ``mpc-…`` is one plan that is executed completely (open loop; decisions stored by earlier versions
 have this name). ``loop-…`` is model predictive control: after each clip's actions the agent
-observes the real frames, adds them to its memory, and plans the rest anew.
+observes the real frames, adds them to its memory, and plans the remaining actions again.
 """
 
 from __future__ import annotations
@@ -47,21 +47,21 @@ from pewm_jax.worlds.rollouts import load_finished
 PREDICTORS = ("empty", "reproject", "memory", "truth")
 NONE = "none"
 REPROJECTION = ReprojectSettings(footprint=2)
-"""How ``reproject`` draws: what ``pewm-jax evaluate small`` chose on the validation split of its
-data."""
+"""Settings of ``reproject``: those that ``pewm-jax evaluate small`` chose on the validation split
+of its data."""
 Policy: TypeAlias = Callable[[TaskInput, int], np.ndarray]
-"""``policy(task, count) -> (count, N)`` discrete actions: proposals, the policy's own choice
+"""``policy(task, count) -> (count, N)`` discrete actions: proposals, with the policy's own choice
 first."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Decision:
-    """What a method chose for a task.
+    """The decision of a method for a task.
 
     Attributes:
         actions_N: the actions.
-        foreseen: what it expected to pay, None for a policy alone.
-        found: after so many samples of a plan, the best actions so far; empty for others.
+        foreseen: the predicted cost; None for a policy alone.
+        found: number of samples of a plan → the best actions so far; empty for other methods.
     """
 
     actions_N: np.ndarray
@@ -71,12 +71,12 @@ class Decision:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Predictors:
-    """The model under test, and the truth.
+    """The predictors: the evaluated model, baselines and ground truth.
 
     Attributes:
-        config: of the model.
+        config: configuration of the model.
         params: its weights.
-        batch: candidates imagined at once.
+        batch: number of candidates imagined at once.
     """
 
     config: Config
@@ -86,27 +86,27 @@ class Predictors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The predictors, worst first as one would expect."""
+        """Return the predictors, in the expected order from worst to best."""
         return (PREDICTORS[0], NONE, *PREDICTORS[1:]) if self.none else PREDICTORS
 
     def rollout(self, predictor: str, goal: Goal) -> Rollout:
-        """Return what a predictor rolls candidates out with, from a task's start."""
+        """Return a predictor's rollout of candidates from a task's start."""
         return self.rollout_from(predictor, self.begin(predictor, goal), goal, goal.walk_T3[0])
 
     def begin(self, predictor: str, goal: Goal) -> Any:
-        """Return a predictor's state after a task's context was observed."""
+        """Return a predictor's state after observing a task's context."""
         if predictor in ("truth", "reproject"):
             return goal.context
         return worlds.start(*self._model(predictor), goal.context)
 
     def observe(self, predictor: str, state: Any, frames: Frames) -> Any:
-        """Return a predictor's state after more real frames."""
+        """Return a predictor's state after observing more real frames."""
         if predictor in ("truth", "reproject"):
             return jax.tree.map(lambda *x: np.concatenate(x), state, frames)
         return worlds.observe(*self._model(predictor), state, frames)
 
     def rollout_from(self, predictor: str, state: Any, goal: Goal, planar_3: np.ndarray) -> Rollout:
-        """Return what a predictor rolls candidates out with, from a place."""
+        """Return a predictor's rollout of candidates from a state and pose."""
         if predictor == "truth":
             return functools.partial(goal.seen, start_3=planar_3)
         if predictor == "reproject":
@@ -124,11 +124,11 @@ class Predictors:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Reprojection:
-    """A rollout without a network: observed pixels, drawn where each candidate's walk ends.
+    """A rollout without a network: observed pixels, reprojected to each candidate's final pose.
 
     Attributes:
-        motion: what an action does.
-        settings: how pixels are drawn.
+        motion: the motion of an action.
+        settings: the rendering settings.
         observed: (S,) observed frames; the last one is the present.
     """
 
@@ -137,7 +137,7 @@ class Reprojection:
     observed: Frames
 
     def __call__(self, actions_KN: Any) -> Frames:
-        """Return what is seen after each candidate's last action, (K, 1) frames."""
+        """Return the frame after each candidate's last action, (K, 1) frames."""
         moves = continuous(self.motion, np.asarray(actions_KN))
         return jax.device_get(_reprojected(self.settings, self.observed, moves))
 
@@ -159,7 +159,7 @@ def method_names(
     """Return the methods of the table.
 
     Args:
-        proposals: numbers of proposals that are ranked.
+        proposals: numbers of ranked proposals.
         predictors: the predictors.
     """
     ranked = (f"rank{count}-{predictor}" for count in proposals for predictor in predictors)
@@ -178,15 +178,15 @@ def decide(
     """Choose actions for a task.
 
     Args:
-        name: of ``method_names``.
+        name: one of ``method_names``.
         goal: the task.
-        predictors: what would be seen.
-        policy: makes proposals.
-        cost: how far that is from the goal.
-        config: of plans.
+        predictors: the predictors.
+        policy: returns proposals.
+        cost: distance of frames from the goal.
+        config: settings of plans.
 
     Raises:
-        UserError: a cost is no number.
+        UserError: a cost is not finite.
     """
     what, _, predictor = name.partition("-")
     if what == "policy":
@@ -207,9 +207,9 @@ def decide(
 def _closed_loop(
     predictor: str, goal: Goal, predictors: Predictors, cost: FrameCost, config: PlanConfig
 ) -> Decision:
-    """Plan, carry out one clip's actions, observe, and plan the rest anew.
+    """Plan, execute one clip's actions, observe, and plan the remaining actions again.
 
-    The horizon shrinks with the remaining actions of the task. When they are spent, the agent may
+    The horizon shrinks with the remaining actions of the task. When they are used up, the agent may
     execute one more clip if its predicted cost is lower than the present cost. The agent does not
     know whether it is at the goal.
     """
@@ -244,7 +244,7 @@ def _closed_loop(
 
 
 class _Watched:
-    """A cost that remembers the best actions after each round."""
+    """A cost that stores the best actions after each round."""
 
     def __init__(self, cost: Callable[..., Any]):
         self.cost, self.found = cost, dict[int, np.ndarray]()
@@ -264,7 +264,7 @@ def proposed(policy: Policy, goal: Goal, count: int) -> np.ndarray:
     """Return a policy's proposals for a task, (count, N).
 
     Raises:
-        UserError: they have another shape, or are no discrete actions.
+        UserError: they have another shape, or are not discrete actions.
     """
     task = goal.input
     proposals = np.asarray(policy(task, count))
@@ -272,31 +272,31 @@ def proposed(policy: Policy, goal: Goal, count: int) -> np.ndarray:
     if not known or not ((proposals >= 0) & (proposals < len(goal.table_A3))).all():
         raise UserError(
             f"the policy proposed {proposals.dtype} of shape {proposals.shape} for {goal.house}: "
-            f"give ({count}, {task.actions}) whole numbers below {len(goal.table_A3)}."
+            f"give ({count}, {task.actions}) integers below {len(goal.table_A3)}."
         )
     return proposals
 
 
 def wanderer(task: TaskInput, count: int, *, seed: int = 0) -> np.ndarray:
-    """Propose walks that know nothing; see ``goals.wander``. A ``Policy``."""
+    """Propose random walks; see ``goals.wander``. A ``Policy``."""
     rng = np.random.default_rng((seed, task.number))
     return np.stack([wander(rng, task.actions) for _ in range(count)])
 
 
 def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Policy:
-    """Return NoMaD as a ``Policy``: its waypoints as the actions that come nearest to them.
+    """Return NoMaD as a ``Policy``: its waypoints, converted to the nearest discrete actions.
 
     Args:
         config: the policy.
         params: its parameters.
-        motion: what an action does.
+        motion: the motion of an action.
     """
 
     def propose(task: TaskInput, count: int) -> np.ndarray:
         if task.actions > config.waypoints:
             raise UserError(
-                f"NoMaD proposes {config.waypoints} waypoints, and {task.actions} actions are "
-                "asked for: use a shorter --horizon."
+                f"NoMaD proposes {config.waypoints} waypoints, but {task.actions} actions are "
+                "requested: use a shorter --horizon."
             )
         seen = nomad_policy.history(config, np.asarray(task.context.rgb_THWC))
         key = jax.random.key(task.number)
@@ -308,7 +308,7 @@ def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Policy:
 
 
 POLICIES: Mapping[str, Policy] = {"wander": functools.partial(wanderer)}
-"""Policies by name; another is named MODULE:FUNCTION, or by the folder of a trained NoMaD."""
+"""Policies by name; others are selected by MODULE:FUNCTION, or by the folder of a trained NoMaD."""
 
 
 SETTINGS = "config.json"
@@ -319,10 +319,10 @@ class LoadedPolicy:
     """A trained NoMaD.
 
     Attributes:
-        folder: of its run.
-        config: of its training.
+        folder: folder of its run.
+        config: configuration of its training.
         weights: the policy's parameters.
-        digest: of weights and settings, see ``model_digest``.
+        digest: hash of weights and settings, see ``model_digest``.
     """
 
     folder: Path
@@ -332,34 +332,34 @@ class LoadedPolicy:
 
     @property
     def motion(self) -> ActionConfig:
-        """What an action of its walks does."""
+        """Return the motion of an action of its walks."""
         return self.config.model.actions
 
 
 def model_digest(weights_hash: str, config: Config) -> str:
-    """Return a hash of all that what a model does depends on: its weights and its settings."""
+    """Return a hash of all that a model's output depends on: its weights and its settings."""
     settings = json.dumps(configuration.to_dict(config.model), sort_keys=True)
     return hashlib.sha256((weights_hash + settings).encode()).hexdigest()
 
 
 def is_run(name: str | Path) -> bool:
-    """Tell whether a name is a folder with settings of a training."""
+    """Return whether a name is the folder of a run."""
     return (Path(name) / SETTINGS).is_file()
 
 
 def open_policy(name: str | Path) -> LoadedPolicy:
-    """Open the run of a NoMaD.
+    """Load the run of a NoMaD.
 
     Raises:
-        UserError: there is no such run, it is damaged or not finished, or it trained another kind
-            of model.
+        UserError: there is no such run, it is damaged or unfinished, or it contains another kind of
+            model.
     """
     folder = Path(name)
     if not is_run(folder):
-        raise UserError(f"{folder} holds no run: train a policy first (pewm-jax train nomad).")
+        raise UserError(f"{folder} contains no run: train a policy first (pewm-jax train nomad).")
     config, params = load_finished(folder)
     if not isinstance(config.model, NomadWorldConfig):
-        raise UserError(f"{folder} trained no policy: name the run of one (pewm-jax train nomad).")
+        raise UserError(f"{folder} contains no policy: give the run of one (pewm-jax train nomad).")
     return LoadedPolicy(
         folder, config, params["policy"], model_digest(file_hash(folder / WEIGHTS), config)
     )

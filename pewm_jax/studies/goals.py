@@ -1,8 +1,9 @@
-"""The tasks of Table 2: a place in a held-out house, seen before, and the picture of a goal.
+"""The tasks of Table 2: a start in a held-out house, earlier observations, and a goal image.
 
-The goal is where a walk of as many actions as a plan has ends, so it can be reached exactly. Before
-the task the agent has looked around where it stands, and around the middle of that walk: the goal's
-surroundings were seen, the goal's own view was not. Everything follows from the task's number.
+The goal is the end of a walk with as many actions as a plan, so it can be reached exactly. Before
+the task the agent has made a full turn at the start and another around the middle of that walk: the
+goal's surroundings were observed, the goal's own view was not. Everything is a function of the
+task's number.
 """
 
 from __future__ import annotations
@@ -21,22 +22,23 @@ from pewm_jax.types import Frames
 
 TRIES = 2000
 LEAST_M = 0.5
-"""A walk that ends nearer to its start is no task."""
+"""Smallest distance from start to goal."""
 NEAR_M, NEAR_LEAST_M = 1.5, 1.0
-"""Tasks near a place start no farther from it, and end at least so far from their start."""
+"""Largest distance of a nearby task's start from the place, and smallest distance from its start to
+its goal."""
 TEST = 2
-"""The first house of the split that nobody is trained on; every third one is of it."""
+"""The first house of the test split; every third house belongs to it."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TaskInput:
-    """What a policy knows of a task.
+    """The inputs of a policy.
 
     Attributes:
-        number: of the task, to draw from.
-        actions: N, how many actions to propose.
-        context: what was seen before; the last frame is the present one.
-        frame: what is seen at the goal, T = 1.
+        number: number of the task, used as a seed.
+        actions: number of actions.
+        context: earlier observations; the last frame is the present one.
+        frame: the frame at the goal, T = 1.
     """
 
     number: int
@@ -50,14 +52,14 @@ class Goal:
     """A task.
 
     Attributes:
-        number: of the task.
+        number: number of the task.
         simulator: the house.
-        table_A3: what each discrete action does.
-        expert_N: the actions of the walk that the goal is the end of.
-        walk_T3: its poses, x, y, yaw, from the start on; T = N + 1.
-        context: what was seen before; the last frame is the present one.
-        frame: what is seen at the goal, T = 1.
-        shortest_m: the length of the shortest way.
+        table_A3: the motion of each discrete action.
+        expert_N: the actions of the walk that ends at the goal.
+        walk_T3: its poses, x, y, yaw, including the start; T = N + 1.
+        context: earlier observations; the last frame is the present one.
+        frame: the frame at the goal, T = 1.
+        shortest_m: length of the shortest path.
     """
 
     number: int
@@ -71,21 +73,21 @@ class Goal:
 
     @property
     def house(self) -> str:
-        """The house's name."""
+        """Return the house's name."""
         return self.simulator.scene.name
 
     @property
     def input(self) -> TaskInput:
-        """What a policy knows of it."""
+        """Return the inputs of a policy."""
         return TaskInput(self.number, len(self.expert_N), self.context, self.frame)
 
     def walked(self, actions_N: np.ndarray, start_3: np.ndarray | None = None) -> np.ndarray:
-        """Return the poses (N + 1, 3) that actions lead through, from the start; walls hold."""
+        """Return the poses (N + 1, 3) along actions from the start, with collisions."""
         start = self.walk_T3[0] if start_3 is None else start_3
         return walked(self.simulator, self.table_A3, start, actions_N)
 
     def seen(self, actions_KN: np.ndarray, start_3: np.ndarray | None = None) -> Frames:
-        """Return what is truly seen after each candidate's last action, (K, 1) frames."""
+        """Return the real frame after each candidate's last action, (K, 1) frames."""
         ends = np.stack([self.walked(actions, start_3)[-1] for actions in np.asarray(actions_KN)])
         return jax.tree.map(lambda x: x[:, None], self.simulator.frames(ends))
 
@@ -93,18 +95,18 @@ class Goal:
 def open_goal(
     number: int, *, houses: int, actions: int, context: int, motion: ActionConfig, size: int
 ) -> Goal:
-    """Make a task.
+    """Return a task.
 
     Args:
-        number: of the task; tasks take houses in turn.
-        houses: how many held-out houses there are.
-        actions: N, of the walk.
-        context: frames seen before, at least 2.
-        motion: what an action does.
-        size: side of the square pictures, pixels.
+        number: number of the task; tasks use houses in turn.
+        houses: number of held-out houses.
+        actions: number of actions.
+        context: number of earlier frames, at least 2.
+        motion: the motion of an action.
+        size: side of the square images, pixels.
 
     Raises:
-        UserError: the house has no such walk.
+        UserError: the house is too small for such a walk.
     """
     house = TEST + len(SPLITS) * (number % houses)
     simulator = open_simulator(house_seed=house, height=size, width=size)
@@ -124,31 +126,32 @@ def open_goal(
         goal = simulator.frames(walk[-1:])
         return Goal(number, simulator, table, expert, walk, context_frames, goal, shortest)
     raise UserError(
-        f"{simulator.scene.name} has no room for a walk of {actions} actions that ends {LEAST_M:g} "
-        "m away: take fewer houses."
+        f"{simulator.scene.name} is too small for a walk of {actions} actions that ends "
+        f"{LEAST_M:g} "
+        "m away: use fewer houses."
     )
 
 
 def near(home: Goal, count: int, actions: int) -> list[Goal]:
-    """Make tasks near the places that were seen before a task.
+    """Return tasks near the places observed before a task.
 
-    They start at most ``NEAR_M`` from where it starts or from the middle of its walk, in sight of
-    that place, and end at most twice as far from there and at least ``NEAR_LEAST_M`` from their
-    start. The last frame of each one's context is what is seen at its own start.
+    They start at most ``NEAR_M`` from its start or from the middle of its walk, visible from that
+    place, and end at most twice as far from there and at least ``NEAR_LEAST_M`` from their own
+    start. The last frame of each one's context is the view at its own start.
 
     Args:
         home: the task.
-        count: how many.
-        actions: of the walk to each goal.
+        count: number of tasks.
+        actions: number of actions of the walk to each goal.
 
     Raises:
-        UserError: the house has no room for them.
+        UserError: the house is too small for them.
     """
-    simulator, made = home.simulator, list[Goal]()
+    simulator, tasks = home.simulator, list[Goal]()
     places = home.walk_T3[[0, len(home.expert_N) // 2], :2]
     rng = np.random.default_rng((home.number, count, actions))
     for start in sample_free(simulator.grid, rng, TRIES):
-        if len(made) == count:
+        if len(tasks) == count:
             break
         planar = np.array([*start, rng.uniform(-np.pi, np.pi)])
         expert = wander(rng, actions)
@@ -166,14 +169,15 @@ def near(home: Goal, count: int, actions: int) -> list[Goal]:
         present = jax.tree.map(lambda *x: np.concatenate(x), home.context, _one(seen, 0))
         shortest = PathsToGoal(simulator.grid, walk[-1, :2]).length(walk[0, :2])
         goal = _one(seen, 1)
-        number = home.number * count + len(made)
-        made.append(Goal(number, simulator, home.table_A3, expert, walk, present, goal, shortest))
-    if len(made) < count:
+        number = home.number * count + len(tasks)
+        tasks.append(Goal(number, simulator, home.table_A3, expert, walk, present, goal, shortest))
+    if len(tasks) < count:
         raise UserError(
-            f"{home.house} has room for {len(made)} of {count} walks near where it was seen: take "
-            "fewer tasks."
+            f"{home.house} has room for only {len(tasks)} of {count} walks near the observed "
+            "places: "
+            "use fewer tasks."
         )
-    return made
+    return tasks
 
 
 def _one(frames: Frames, number: int) -> Frames:
@@ -181,13 +185,13 @@ def _one(frames: Frames, number: int) -> Frames:
 
 
 def _blocked(walk_T3: np.ndarray, actions_N: np.ndarray) -> bool:
-    """Tell whether a step forward led nowhere."""
+    """Return whether a forward step was blocked."""
     moves = np.linalg.norm(np.diff(walk_T3[:, :2], axis=0), axis=-1)
     return bool(((moves < 1e-6) & (actions_N == FORWARD)).any())
 
 
 def wander(rng: np.random.Generator, actions: int) -> np.ndarray:
-    """Return a walk that knows nothing: it turns to one side for a while, then goes on."""
+    """Return a random walk: it turns to one side for a while, then goes forward."""
     done: list[int] = []
     while len(done) < actions:
         done += [int(rng.choice([TURN_LEFT, TURN_RIGHT]))] * int(rng.integers(0, 4))
@@ -198,7 +202,7 @@ def wander(rng: np.random.Generator, actions: int) -> np.ndarray:
 def walked(
     simulator: Simulator, table_A3: np.ndarray, start_3: np.ndarray, actions_N: np.ndarray
 ) -> np.ndarray:
-    """Return the poses (N + 1, 3) of an agent that carries out discrete actions."""
+    """Return the poses (N + 1, 3) of an agent that executes discrete actions."""
     poses = [np.asarray(start_3, np.float64)]
     for action in np.asarray(actions_N):
         poses.append(move(simulator.grid, poses[-1], table_A3[int(action)])[0])
@@ -206,7 +210,7 @@ def walked(
 
 
 def _around(planar_3: np.ndarray, views: int) -> np.ndarray:
-    """Return a turn around a place in so many views, the last one straight ahead."""
+    """Return the poses of a full turn in ``views`` steps, the last one straight ahead."""
     poses = np.tile(planar_3, (views, 1))
     poses[:, 2] += 2 * np.pi * np.arange(1, views + 1) / views
     return poses

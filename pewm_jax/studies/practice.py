@@ -1,8 +1,8 @@
-"""What a policy learns of a new house by practice in imagination (the paper's Figure 6b).
+"""What a policy learns about a new house by practice in imagination (the paper's Figure 6b).
 
-In each held-out house a trained NoMaD practises from the same few pictures: in the world with its
-memory, in the world without, and, as the best there can be, in the house itself. Each time it
-learns from as many walks, in as many steps, and is then sent to the same goals in the real house.
+In each held-out house a trained NoMaD practises from the same few images: in the world with its
+memory, in the world without it, and, as an upper bound, in the house itself. It trains on equally
+many walks for equally many steps each time, and is then sent to the same goals in the real house.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from pewm_jax.studies.table2_page import score_cells
 
 Log = Callable[[str], Any]
 DECIDED_BY, LEVEL = "success", 0.01
-"""The score by which practice in the house itself has to beat chance before worlds are compared,
-and the level of that test."""
+"""The score by which practice in the house itself must beat chance before worlds are compared, and
+the level of that test."""
 COLUMNS: Mapping[str, tuple[str, int]] = {
     "success": ("success, %", 1),
     "spl": ("SPL, %", 1),
@@ -65,7 +65,7 @@ LABELS = {
 }
 SHOWN_PLACES = {"real": "the house itself", "memory": "with its memory", "empty": "empty memory"}
 SHOWN = 11
-"""Pictures of a walk."""
+"""Number of images per walk."""
 
 
 def run(
@@ -73,19 +73,18 @@ def run(
 ) -> Path:
     """Let a policy practise in every house, and measure it before and after.
 
-    Args:
-        model: a run folder, or the name of weights that come with the library.
-        policy: the run of a NoMaD.
-        out: the folder that everything is kept in; the same call goes on.
-        study: the settings.
-        log: shows a line.
+    model: a run folder, or the name of weights that ship with the library.
+    policy: the run of a NoMaD.
+    out: the output folder; the same call resumes.
+    study: the settings.
+    log: prints a line.
 
     Returns:
-        The path of the table in Markdown; beside it .png and ``results.json``.
+        The path of the table in Markdown; in the same folder .png and ``results.json``.
 
     Raises:
-        UserError: the weights are absent or do not fit each other, a loss is not finite, or the
-            folder holds pieces of other settings.
+        UserError: weights are missing or incompatible, a loss is not finite, or the folder contains
+            pieces with other settings.
     """
     world, begun = open_run(model), open_policy(policy)
     _require_fit(world, begun, study, model, policy)
@@ -135,28 +134,29 @@ def _require_fit(
     model: str | Path,
     policy: str | Path,
 ) -> None:
-    """Refuse what would end later, and in words that do not help."""
+    """Raise an error early, with a clear message, if model, policy and settings do not fit."""
     if not has_memory(world):
-        raise UserError(f"{model} has no memory, and what a memory adds is the question.")
+        raise UserError(f"{model} has no memory, but the study measures the effect of a memory.")
     clip, own = world.config.model.clip, begun.config.model.clip
     if clip.height != clip.width or not clip.depth:
         what = f"{clip.width}×{clip.height}" + ("" if clip.depth else " without depth")
-        raise UserError(f"{model} imagines pictures of {what}: give a model of square RGB-D ones.")
+        raise UserError(f"{model} imagines images of {what}: use a model of square RGB-D images.")
     if (own.height, own.width) != (clip.height, clip.width):
         raise UserError(
-            f"{policy} learned from pictures of {own.width}×{own.height}, and {model} imagines "
+            f"{policy} was trained on images of {own.width}×{own.height}, but {model} imagines "
             f"{clip.width}×{clip.height}: train one of them at the other's size."
         )
     if begun.motion != world.config.model.actions:
         raise UserError(
-            f"{policy} takes other steps than {model} imagines ({begun.motion} and "
+            f"{policy} uses other actions than {model} ({begun.motion} and "
             f"{world.config.model.actions}): train one of them with the other's actions."
         )
     frames = 1 + study.practice.blocks * begun.config.model.policy.waypoints
     if frames < own.frames:
         raise UserError(
-            f"walks of {study.practice.blocks} blocks have {frames} frames, and {policy} learns "
-            f"from clips of {own.frames}: use more --blocks."
+            f"walks of {study.practice.blocks} blocks have {frames} frames, but {policy} is "
+            "trained "
+            f"on clips of {own.frames}: use more --blocks."
         )
 
 
@@ -177,16 +177,16 @@ def _first_walk(
 
 
 def power(practised_C: np.ndarray, chance_C: np.ndarray, houses_C: np.ndarray) -> float | None:
-    """Return the p value that practice in the house itself is better than chance.
+    """Return the p value of "practice in the house itself is better than chance".
 
-    Practice in the true house bounds what practice in any world can teach. Where it does not beat
-    walking without looking, the task cannot tell worlds apart. The p value is one-sided, from the
-    bootstrap over houses; None where there are fewer than two houses.
+    Practice in the real house is an upper bound for practice in any world. If it does not beat
+    random walks, the task cannot distinguish worlds. The p value is one-sided, from the bootstrap
+    over houses; None for fewer than two houses.
 
     Args:
-        practised_C: the score of each goal after practice in the house itself; more is better.
-        chance_C: that of walking without looking.
-        houses_C: the number of each goal's house.
+        practised_C: score of each goal after practice in the house itself; higher is better.
+        chance_C: score of each goal with random walks.
+        houses_C: index of each goal's house.
     """
     gain_C = practised_C - chance_C
     p_value = intervals.p_over_houses(gain_C, houses_C)
@@ -251,7 +251,7 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
 def write_page(
     results: Mapping[str, Any], page: Path, shown: Sequence[tuple[str, Mapping[str, PracticeWalk]]]
 ) -> None:
-    """Write the table as ``page`` (Markdown), and its picture beside it."""
+    """Write the table as ``page`` (Markdown), and its image beside it."""
     atomic.write_text(page, markdown(results, page.stem if shown else ""))
     if shown:
         pictures.save_png(page.with_suffix(".png"), picture(shown))
@@ -275,12 +275,12 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
     drill = about["practice"]
     how = (
         f"{about['model']}; NoMaD; {results['houses']} held-out houses, {about['tasks']} goals in "
-        f"each, {len(about['seeds'])} seed(s). In each house the policy begins with the same few "
-        f"pictures, walks {drill['walks']} times ({drill['blocks']} proposals each) and learns "
-        f"{about['steps']} steps from these walks alone. Then it is sent to goals "
-        f"{about['actions']} actions away, and may take {about['most']}; it is stopped at the "
-        f"first moment within {about['within_m']:g} m and {about['within_deg']:g}° of the goal, "
-        "which is success (it need not know that it is there). Means over houses; ± is half of "
+        f"each, {len(about['seeds'])} seed(s). In each house the policy starts from the same few "
+        f"images, walks {drill['walks']} times ({drill['blocks']} proposals each) and trains "
+        f"{about['steps']} steps on these walks only. Then it is sent to goals "
+        f"{about['actions']} actions away, with at most {about['most']} actions; it is stopped as "
+        f"soon as it is within {about['within_m']:g} m and {about['within_deg']:g}° of the goal, "
+        "which is success (it need not detect the goal). Means over houses; ± is half of "
         f"the 95 % interval (bootstrap over houses). {about['date']}."
     )
     parts = [
@@ -294,8 +294,8 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
         parts.append(f"## Differences\n\nPaired by goal and seed.\n\n{table}")
     table = Table.of(["", "forward", "through walls"], walked).markdown()
     parts.append(
-        "## What it learned from\n\nOf the actions of its walks in per cent, how many went "
-        f"forward, and of these how many through real walls.\n\n{table}"
+        "## What it learned from\n\nPercentage of the actions of its walks that go "
+        f"forward, and percentage of these that pass through real walls.\n\n{table}"
     )
     if stem:
         parts.append(f"## What it saw\n\n![Walks in the house and in the world]({stem}.png)")
@@ -303,31 +303,32 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
 
 
 def _power(results: Mapping[str, Any]) -> str:
-    """Return whether the task can tell worlds apart, or that it was not tested."""
+    """Return a sentence on whether the task can distinguish worlds."""
     test = results.get("power")
-    if test is None:  # results of version 0.1, which holds no score of each goal
+    if test is None:  # results of version 0.1, which contain no scores per goal
         one, other = (results["rows"][how]["success"]["mean"] for how in ("real", "chance"))
         return (
-            f"**Practice in the house itself reaches {one:.1f} % of the goals, walking without "
-            f"looking {other:.1f} %. That one beats the other was not tested, and no comparison "
+            f"**Practice in the house itself reaches {one:.1f} % of the goals, random walks "
+            f"{other:.1f} %. The difference was not tested, and no comparison "
             "between worlds is drawn.**"
         )
     if test["p"] is None:
         return "One house gives no p value: no comparison is drawn."
     words = (
-        f"Practice in the house itself against walking without looking: p = {test['p']:.2g} "
+        f"Practice in the house itself against random walks: p = {test['p']:.2g} "
         f"(one-sided, {COLUMNS[test['metric']][0]}, bootstrap over houses)."
     )
     if test["compares"]:
-        return f"{words} Below {test['level']:g}: the task can tell worlds apart."
+        return f"{words} Below {test['level']:g}: the task can distinguish worlds."
     return (
-        f"**{words} Not below {test['level']:g}: the task has no power, since even practice in the "
+        f"**{words} Not below {test['level']:g}: the task has no power, because even practice in "
+        "the "
         "house itself does not beat chance. No comparison between worlds is drawn from it.**"
     )
 
 
 def picture(shown: Sequence[tuple[str, Mapping[str, PracticeWalk]]]) -> np.ndarray:
-    """Return the first walk of each house, seen in each place, as rows; (H, W, 3) uint8."""
+    """Return the first walk of each house in each environment, as rows; (H, W, 3) uint8."""
     rows = []
     for house, walks in shown:
         for how, words in SHOWN_PLACES.items():

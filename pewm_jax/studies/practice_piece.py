@@ -1,7 +1,7 @@
-"""One piece of the practice study: one policy in one house; and the settings of the study.
+"""One unit of the practice study: one policy in one house; and the settings of the study.
 
-A policy practises in a place (``planning.practice``), its walks are kept as a dataset, it learns
-from them, and is sent to goals in the real house.
+A policy practises in an environment (``planning.practice``), its walks are stored as a dataset, it
+is trained on them, and it is sent to goals in the real house.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from pewm_jax.train import loop
 
 CHANCE, BEFORE, REAL, MEMORY, EMPTY = "chance", "before", "real", "memory", "empty"
 LEARNED = (MEMORY, EMPTY, REAL)
-"""Where a policy practises."""
+"""The environments in which a policy practises."""
 WITHIN_M, WITHIN_DEG = 0.35, 45.0
-"""A goal is reached this near to it, and with a heading this near to its own, as in Table 2."""
+"""Distance and heading difference within which a goal counts as reached, as in Table 2."""
 ROWS = (CHANCE, BEFORE, *LEARNED)
 
 
@@ -51,16 +51,16 @@ class PracticeConfig:
     """The settings of the study.
 
     Attributes:
-        houses: held-out houses.
-        tasks: goals in each.
-        actions: of the walk to a goal.
-        most: actions that the policy may take for it.
-        replan: actions taken of a proposal before the next.
-        practice: how the policy practises.
-        steps: of training on its walks.
-        learning_rate: of that training.
-        seeds: of practice and training.
-        shown: houses whose first walks are in the picture.
+        houses: number of held-out houses.
+        tasks: number of goals in each.
+        actions: number of actions of the walk to a goal.
+        most: largest number of actions of the policy per goal.
+        replan: number of actions taken from a proposal before the next.
+        practice: settings of practice.
+        steps: number of training steps on its walks.
+        learning_rate: learning rate of that training.
+        seeds: seeds of practice and training.
+        shown: number of houses whose first walks are in the image.
     """
 
     houses: int = 12
@@ -83,7 +83,7 @@ class PracticeConfig:
             len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds),
             f"seeds are {self.seeds}: give different ones, such as 0 1 2.",
         )
-        require(min(self.seeds) >= 0, f"seeds are {self.seeds}: use numbers from 0 on.")
+        require(min(self.seeds) >= 0, f"seeds are {self.seeds}: use 0 or more.")
         require(self.shown >= 0, f"shown is {self.shown}: use 0 or more.")
         require(
             math.isfinite(self.learning_rate) and self.learning_rate > 0,
@@ -100,19 +100,19 @@ def make(
     seed: int,
     folder: Path,
 ) -> dict[str, Any]:
-    """Return what one policy reaches in one house, and what it practised.
+    """Return the scores of one policy in one house, and statistics of its practice.
 
     Args:
         world: the world that imagines the house.
-        begun: the policy before it practises.
-        home: the house, and what was seen of it.
+        begun: the policy before practice.
+        home: the house, and its observations.
         study: the settings.
         how: one of ``ROWS``.
-        seed: of practice and training.
-        folder: where its walks and its training are kept.
+        seed: seed of practice and training.
+        folder: folder of its walks and its training.
 
     Raises:
-        UserError: a loss is not finite, or the folder holds walks of other settings.
+        UserError: a loss is not finite, or the folder contains walks with other settings.
     """
     piece: dict[str, Any] = {"house": home.house, "walked": {}}
     act = act_of(begun)
@@ -125,7 +125,7 @@ def make(
 
 
 def _by_chance(count: int) -> Act:
-    """Return a policy that walks without looking; see ``goals.wander``."""
+    """Return a policy of random walks; see ``goals.wander``."""
 
     def act(rgb_SHWC: np.ndarray, goal_HWC: np.ndarray | None, key: jax.Array) -> np.ndarray:
         del rgb_SHWC, goal_HWC
@@ -136,7 +136,7 @@ def _by_chance(count: int) -> Act:
 
 
 def _walked(folder: Path, home: Goal) -> dict[str, float]:
-    """Return the per cent of actions that went forward, and of these that went through walls."""
+    """Return the percentage of forward actions, and of these the percentage through walls."""
     forward, through, count = 0, 0, 0
     for episode in EpisodeSource(folder):
         ids = np.asarray(episode.action_ids)
@@ -152,7 +152,7 @@ def _walked(folder: Path, home: Goal) -> dict[str, float]:
 
 
 def open_home(study: PracticeConfig, config: Config, house: int) -> Goal:
-    """Return the first task of a house, whose context is what the agent has seen of it."""
+    """Return the first task of a house, whose context contains the agent's observations."""
     return goals.open_goal(
         house,
         houses=study.houses,
@@ -164,14 +164,14 @@ def open_home(study: PracticeConfig, config: Config, house: int) -> Goal:
 
 
 def place_of(world: LoadedRun, home: Goal, motion: ActionConfig, how: str) -> PracticeEnvironment:
-    """Return where a policy practises: one of ``LEARNED``."""
+    """Return the environment of practice: one of ``LEARNED``."""
     if how == REAL:
         return SimulatedEnvironment(home.simulator, motion, home.context)
     return ImaginedEnvironment(world.config, world.params, home.context, memory=how == MEMORY)
 
 
 def act_of(policy: LoadedPolicy) -> Act:
-    """Return a policy as practice and goals ask it."""
+    """Return a policy as an ``Act``, for practice and goals."""
     return practice.nomad(policy.config.model.policy, policy.weights, policy.motion)
 
 
@@ -184,7 +184,7 @@ def _learned(
     seed: int,
     folder: Path,
 ) -> LoadedPolicy:
-    """Let the policy practise, and return what it has become."""
+    """Let the policy practise, and return the trained policy."""
     place = place_of(world, home, begun.motion, how)
     _collect(folder / "data" / "train", place, home, begun, study, seed)
     config = begun.config
@@ -194,7 +194,7 @@ def _learned(
         learning_rate=study.learning_rate,
         warmup=min(config.train.policy.warmup, study.steps // 10),  # type: ignore[attr-defined]
     )
-    shutil.rmtree(folder / "run", ignore_errors=True)  # half a training is begun anew: it is short
+    shutil.rmtree(folder / "run", ignore_errors=True)  # restart partial training: it is short
     train = dataclasses.replace(
         config.train, run=str(folder / "run"), start=str(begun.folder), seed=seed, policy=stage
     )
@@ -212,7 +212,7 @@ def _collect(
     study: PracticeConfig,
     seed: int,
 ) -> None:
-    """Write the walks of a practice as a dataset, or find them written."""
+    """Write the walks of a practice as a dataset, unless they exist."""
     settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(study.practice)}
     state = resume.examine(folder, settings)
     if state == "complete":
@@ -246,9 +246,9 @@ def _record(walk: PracticeWalk, table_A3: np.ndarray, name: str, house: str) -> 
 
 
 def _measured(home: Goal, act: Act, study: PracticeConfig, seed: int) -> list[dict[str, float]]:
-    """Send a policy to goals near the places that were seen, in the real house.
+    """Return the scores of a policy sent to goals near the observed places, in the real house.
 
-    It is stopped at the first moment within reach of the goal: it need not know that it is there.
+    It is stopped as soon as it is within reach of the goal: it need not detect the goal.
     """
     scored = []
     for task in goals.near(home, study.tasks, study.actions):

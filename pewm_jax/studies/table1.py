@@ -1,7 +1,7 @@
-"""Table 1 by one command: which memory works? Every finished piece is stored and reused.
+"""Table 1 by one command: comparison of memories. Every finished unit is stored and reused.
 
-The command fixes the protocol, times the trainings, and then trains and scores every row, seed by
-seed. It writes the table after each seed.
+The command fixes the protocol, times the trainings, and then trains and scores every row, one seed
+after another. It writes the table after each seed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RESULTS, HOURS = "results.json", "hours.json"
 SCHEMA = 2
 """Version of the layout of the results, which ``docs/table1.md`` describes."""
 EMPTY = "backbone"
-"""The row of the backbone alone: what every row's weights give with an empty memory."""
+"""The row of the backbone alone: the scores of every row's weights with an empty memory."""
 
 
 def run(
@@ -52,32 +52,32 @@ def run(
     weights: Mapping[str, str | Path] | None = None,
     log: Callable[[str], Any] = print,
 ) -> Path:
-    """Train and score the rows of Table 1, or of an ablation, and write the table.
+    """Train and score the rows of Table 1 or of an ablation, and write the table.
 
     Args:
         base: the settings that all rows share, such as the preset ``table1``.
-        out: the folder that everything is kept in.
+        out: the output folder.
         minutes: processor minutes of training steps, of a backbone and of a row.
-        steps: the numbers of steps instead: equal steps and not equal time.
-        seeds: of the trainings.
+        steps: numbers of steps instead: equal steps instead of equal time.
+        seeds: training seeds.
         only: names of rows; by default all.
         ablation: one of ``rows.ABLATIONS`` instead of the table.
-        values: of the ablation; by default its own.
+        values: values of the ablation; by default its own.
         weights: see ``scorer.open_scorer``.
-        log: shows a line.
+        log: prints a line.
 
     Returns:
-        The path of the table in Markdown; beside it are ``.tex``, ``.csv``, ``.png`` and
+        The path of the table in Markdown; in the same folder are ``.tex``, ``.csv``, ``.png`` and
         ``results.json``.
 
     Raises:
-        UserError: the data are absent or do not fit, a name is unknown, a training diverged.
-        Interrupted: what is done is kept; the same call goes on.
+        UserError: the data are missing or unsuitable, a name is unknown, or a training diverged.
+        Interrupted: finished work is stored; the same call resumes.
     """
     chosen = _rows(base, only, ablation, values)
     if not seeds or len(set(seeds)) < len(seeds) or min(seeds) < 0:
         raise UserError(
-            f"seeds are {list(seeds)}: give each training seed once, one at least, from 0 on."
+            f"seeds are {list(seeds)}: give distinct training seeds of 0 or more, at least one."
         )
     study = Study(base, out, minutes, steps)
     scorer = open_scorer(base, out, log, weights)
@@ -114,29 +114,29 @@ def _rows(
 ) -> tuple[Row, ...]:
     if type(base.model) is not ModelConfig:
         raise UserError(
-            f"the settings are of a {type(base.model).__name__}, and Table 1 compares memories of "
-            "the world pewm: name a preset of that, such as table1."
+            f"the settings are of a {type(base.model).__name__}, but Table 1 compares memories of "
+            "the world pewm: use a preset of that, such as table1."
         )
     if ablation and only:
-        raise UserError("rows are of the table, and not of an ablation: leave them out.")
+        raise UserError("rows apply to the table, not to an ablation: omit them.")
     if ablation:
         return table1_rows.ablated(base, ablation, values)
     if values:
-        raise UserError("values are of an ablation: name one, or leave them out.")
+        raise UserError("values apply to an ablation: choose one, or omit them.")
     every = table1_rows.main_rows(base)
     unknown = sorted(set(only) - {row.name for row in every})
     if unknown:
         names = ", ".join(row.name for row in every)
-        raise UserError(f"there are no rows {', '.join(unknown)}; choose of {names}.")
+        raise UserError(f"there are no rows {', '.join(unknown)}; choose from {names}.")
     return tuple(row for row in every if not only or row.name in only)
 
 
 def _one(
     study: Study, scorer: Scorer, row: Row, seed: int, plan: dict[str, Any], log: Callable
 ) -> dict[str, Arrays]:
-    """Train and score a row; also its backbone, where that is a row of the table.
+    """Train and score a row, and also its backbone if that is a row of the table.
 
-    What was recorded of it on another machine is taken, where nothing of it is here.
+    Scores recorded on another machine are used if the row has no local folder.
     """
     steps = {name: entry["steps"] for name, entry in plan.items()}
     file = recorded_path(study, row, seed, steps, scorer.name)
@@ -146,7 +146,7 @@ def _one(
         return before
     others = [] if before else sorted(file.parent.glob(f"seed{seed}-{row.name}-????????????.npz"))
     if others:
-        log(f"{others[0]} is of other settings, data, weights or code, and is left aside")
+        log(f"{others[0]} is from other settings, data, weights or code, and is ignored")
     config = train(study, row, seed, steps, log)
     found = {row.name: scorer.row(config, memory=row.reads)}
     if row.depth:
@@ -158,7 +158,7 @@ def _one(
 
 @contextlib.contextmanager
 def _timing(out: Path, name: str) -> Iterator[None]:
-    """Add up the hours that a piece took, over all calls, in ``hours.json``."""
+    """Add the hours of a unit, over all calls, to ``hours.json``."""
     began, worked = time.monotonic(), time.process_time()
     try:
         yield
@@ -171,7 +171,7 @@ def _timing(out: Path, name: str) -> Iterator[None]:
 
 
 def read_hours(path: Path) -> dict[str, tuple[float, float]]:
-    """Return for each piece its hours on the clock and of the processor."""
+    """Return wall-clock and processor hours of each unit."""
     try:
         return {name: (pair[0], pair[1]) for name, pair in json.loads(path.read_text()).items()}
     except (FileNotFoundError, ValueError, AttributeError, TypeError, LookupError):
@@ -186,7 +186,7 @@ def _facts(
     seeds: Sequence[int],
     ablation: str,
 ) -> dict[str, Any]:
-    """Return how the table was made."""
+    """Return the description of how the table was made."""
     pieces = ["before", *(f"seed{seed}/{row.name}" for seed in seeds for row in rows)]
     kept = read_hours(study.out / HOURS)
     hours = [kept[name] for name in pieces if name in kept]

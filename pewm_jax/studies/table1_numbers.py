@@ -15,9 +15,9 @@ from pewm_jax.studies.table1_rows import CONTROL, PAPER_FORM
 from pewm_jax.studies.table1_scoring import SRC, Arrays
 
 SETS = ("fvd", "kvd")
-"""Measures of whole sets of clips, which have no number per clip."""
+"""Metrics of whole sets of clips, which have no value per clip."""
 LOWER = ("lpips", "dreamsim", "depth_mae", "depth_rel", *SETS, "fvd_half", "kvd_half")
-"""Measures of which less is better."""
+"""Metrics for which lower is better."""
 CHAIN = (
     "none",
     "none-attend",
@@ -27,17 +27,18 @@ CHAIN = (
     "voxel-attend",
     "voxel-attend-sinusoid",
 )
-"""The paper's order, worst first, like beside like: the second is a reader with nothing to read,
-and all read with projective positions but the last, which is the paper's own form."""
+"""The steps of the paper's order, worst first, between comparable rows: the second row has a reader
+without input, and all readers use projective positions except the last, which is the paper's own
+form."""
 GAP = "psnr/seen - unseen"
-"""How much better seen pixels are; of interest as a difference between rows: what a memory adds."""
+"""PSNR of seen minus unseen pixels; its difference between rows shows what a memory adds."""
 AGAINST = ("none", "none-attend", "voxel-attend", "reproject", "copy")
-"""What every row is compared with, clip by clip; in an ablation also the table's own row, and what
-has nothing to read (``none-attend-…``)."""
+"""The reference rows for paired differences; in an ablation also the table's own row, and the
+reader without input (``none-attend-…``)."""
 
 
 def by_clip(arrays: Arrays) -> dict[str, np.ndarray]:
-    """Return a number per clip of each measure, (C,), under names such as ``psnr/seen``."""
+    """Return a value per clip of each metric, (C,), under names such as ``psnr/seen``."""
     found = {
         f"{metric}/{mask}": values
         for mask, by_metric in scores(arrays["sums"].sum(1)).items()
@@ -61,23 +62,23 @@ def summary(
     nets: Mapping[str, Any],
     frames: int = 0,
 ) -> dict[str, Any]:
-    """Turn scores into the numbers of the table.
+    """Return the numbers of the table from the scores.
 
     Args:
-        pieces: row → its scores, one for each training seed; methods without a network have one.
+        pieces: row → its scores, one per training seed; methods without a network have one.
         truth: from ``Scorer.truth``.
-        houses_C: the number of each clip's house.
-        nets: the measures that need weights.
-        frames: of the clips that FVD and KVD are of, for their names.
+        houses_C: index of each clip's house.
+        nets: the metrics that need weights.
+        frames: number of frames of the clips of FVD and KVD, for their names.
 
     Returns:
-        ``rows[name]``: ``seeds``; ``measures[name]`` as ``intervals.entry`` (training seeds are
-        averaged within a clip), with ``over_seeds`` where there are several; ``per_frame``; ``fvd``
-        and ``kvd`` of all clips and ``fvd_half`` and ``kvd_half``, which are to be compared with
-        the floor, with ``per_seed``. ``floors``, with the ``name`` of what has so many clips; and
-        ``differences[against][row][measure]``, paired, row − against, with both intervals (of FVD
-        and KVD over seeds alone), p values over houses and over seeds (``p``, ``p_seeds``), and
-        those adjusted for the rows of the table (``adjust``).
+        ``rows[name]``: ``seeds``; ``measures[name]`` as ``intervals.entry`` (averaged over training
+        seeds within a clip), with ``over_seeds`` if there are several; ``per_frame``; ``fvd`` and
+        ``kvd`` of all clips, and ``fvd_half`` and ``kvd_half``, to be compared with the floor, with
+        ``per_seed``. ``floors``, with the ``name`` for that number of clips; and
+        ``differences[against][row][measure]``, paired, row − against, with both intervals (for FVD
+        and KVD only over seeds), p values over houses and over seeds (``p``, ``p_seeds``), and the
+        same adjusted for the rows of the table (``adjust``).
     """
     values = {name: _stacked([by_clip(each) for each in group]) for name, group in pieces.items()}
     rows: dict[str, Any] = {}
@@ -154,7 +155,7 @@ def adjust(family: Sequence[Mapping[str, dict[str, Any]]]) -> None:
 
 
 def _stacked(each: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Join the numbers of training seeds along a first axis."""
+    """Stack the values of training seeds along a first axis."""
     return {key: np.stack([one[key] for one in each]) for key in each[0]}
 
 
@@ -170,7 +171,7 @@ def _entry(values_KC: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
 def _set_distances(
     kind: str, net: Any, group: Sequence[Arrays], truth: Arrays
 ) -> dict[str, dict[str, Any]]:
-    """Return FVD or KVD of each training seed, their mean and Student's interval; and of halves."""
+    """Return FVD or KVD per training seed, with mean and Student's interval; also of halves."""
     found = [net.score(each["logits"], truth["logits"]) for each in group]
     values = {kind: [float(score.value) for score in found]}
     if all(score.half is not None for score in found):
@@ -200,8 +201,8 @@ def _differences(
 ) -> dict[str, Any]:
     """Return first − second, clip by clip, and over training seeds.
 
-    Rows of one training seed share a backbone and are paired; what has no network, and thus no
-    seeds, counts for each.
+    Rows of one training seed share a backbone and are paired; methods without a network, and so
+    without seeds, are paired with every seed.
     """
     found = {}
     for measure in first:

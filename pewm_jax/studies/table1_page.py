@@ -25,10 +25,11 @@ COLUMNS: Mapping[str, tuple[str, int]] = {
     "src": ("SRC[alex]", 1),
     "depth_mae/all": ("depth, m", 3),
 }
-"""Measure → heading, decimals; FVD and KVD of halves, which have a floor of as many clips."""
+"""Metric → heading, decimals; FVD and KVD are those of halves, whose floor has equally many
+clips."""
 TRUTH = "the truth against itself"
 PLACES = "two different places"
-"""Rows beside the trained ones: what the truth gets, and what says nothing at all (SRC)."""
+"""Labels of reference rows: the scores of the ground truth, and of two different places (SRC)."""
 
 
 PAPER: Mapping[str, tuple[float, ...]] = {
@@ -42,18 +43,18 @@ PAPER: Mapping[str, tuple[float, ...]] = {
 ALPHA = 0.05
 """Level of significance, after Holm's correction."""
 SIGNIFICANT, HOUSES_ONLY = "*", "°"
-"""Mark differences that are significant over houses and over training seeds, and those that are
-significant over houses and not over training seeds."""
+"""Marks of differences that are significant over houses and over training seeds, and of those that
+are significant only over houses."""
 PAIRED = (
-    "Paired by clip, with 95 % intervals over houses; FVD, of sets, is paired by training seed. "
-    "Intervals are not adjusted for the number of comparisons; marks are: "
+    "Paired by clip, with 95 % intervals over houses; FVD, a metric of sets, is paired by training "
+    "seed. Intervals are not adjusted for the number of comparisons; marks are: "
     f"{SIGNIFICANT} significant (p < {ALPHA}) over houses and over training seeds, {HOUSES_ONLY} "
-    "over houses and not over training seeds (or there is one seed), both after Holm's correction "
+    "over houses but not over training seeds (or there is one seed), both after Holm's correction "
     "for the comparisons of a column; without a mark, not significant over houses."
 )
 PAPER_HEADINGS = ("PSNR, dB", "SSIM", "LPIPS", "FVD", "DreamSim", "SRC")
 OURS = ("psnr/all", "ssim/all", "lpips/all", "fvd_half", "dreamsim", "src")
-"""Our measure in the place of each of the paper's."""
+"""Our metric for each of the paper's."""
 STEP_MEASURES: Mapping[str, int] = {
     "psnr/seen": 2,
     "psnr/unseen": 2,
@@ -64,22 +65,23 @@ STEP_MEASURES: Mapping[str, int] = {
     "fvd_half": 0,
     "src": 1,
 }
-"""Measures whose differences are shown → decimals; beside them that of seeds."""
+"""Metrics whose differences are shown → decimals."""
 STEP_HEADINGS = (
     *("PSNR seen, dB", "PSNR unseen, dB", "seen − unseen, dB"),
     *("SSIM", "LPIPS[alex]", "depth, m", "FVD", "SRC[alex]"),
     "PSNR seen, over training seeds",
 )
 RIVALS = ("none", "none-attend", "voxel-attend", "reproject")
-"""Rows that every row is set against on the page."""
+"""Reference rows of the differences on the page."""
 NOT_COMPARABLE = (
-    "The numbers of the paper are of 512 × 512 pictures of scanned houses, a model of (by our "
-    "reckoning) about 3 billion parameters trained on 8 GPUs for days, DINOv2 features, and an FVD "
-    "and an LPIPS whose networks and numbers of clips are not named; ours are of small pictures "
-    "and a small model (above). Only the order of the rows, and the signs of differences, can be "
-    "compared. LPIPS and SRC are by AlexNet "
-    "here; SRC is by DINOv2 there, over clips imagined one after the other with the map growing "
-    "between them, and here over a way out and back within one clip: it says nothing of memory."
+    "The paper's numbers are for 512 × 512 images of scanned houses, a model of about 3 billion "
+    "parameters (our estimate) trained on 8 GPUs for days, DINOv2 features, and an FVD and an "
+    "LPIPS "
+    "whose networks and numbers of clips are not specified; ours are for small images and a small "
+    "model (above). Only the order of the rows, and the signs of differences, can be compared. "
+    "LPIPS and SRC use AlexNet here; the paper's SRC uses DINOv2, over consecutive imagined clips "
+    "with the map growing between them, and ours a way out and back within one clip: it does not "
+    "measure memory."
 )
 
 
@@ -89,7 +91,7 @@ PAPER_ABLATIONS: Mapping[str, str] = {
     "features": "The paper's (its appendix), of a map of points / CLIP / DINO features: PSNR 21.2 "
     "/ 21.5 / 22.5, LPIPS 0.20 / 0.18 / 0.16. Only the order can be compared.",
 }
-"""Ablation → what the paper has of it."""
+"""Ablation → the paper's numbers."""
 
 
 def write(results: Mapping[str, Any], page: Path) -> None:
@@ -102,25 +104,25 @@ def write(results: Mapping[str, Any], page: Path) -> None:
 
 
 def rows_of(results: Mapping[str, Any]) -> list[str]:
-    """Return the rows: those of the table as listed, then the backbone, then without a network."""
+    """Return the rows in order: those of the table, the backbone, methods without a network."""
     listed = list(results["about"]["rows"])
     return [*listed, *(name for name in results["rows"] if name not in listed)]
 
 
 def columns_of(results: Mapping[str, Any]) -> list[str]:
-    """Return the measures that any row has, as listed."""
+    """Return the metrics that any row has, in the listed order."""
     rows = results["rows"].values()
     return [name for name in COLUMNS if any(name in row["measures"] for row in rows)]
 
 
 def heading(results: Mapping[str, Any], measure: str) -> str:
-    """Return the heading of a measure; of a distance of sets the name with its number of clips."""
+    """Return a metric's heading; for a distance of sets, including its number of clips."""
     floor = results["floors"].get(measure.removesuffix("_half"), {})
     return floor.get("name") or COLUMNS[measure][0]
 
 
 def label(results: Mapping[str, Any], name: str) -> str:
-    """Return a row's name for people."""
+    """Return a row's display name."""
     known = {
         "backbone": "(the backbone that the others start from)",
         "reproject": "reprojection, no network",
@@ -131,13 +133,13 @@ def label(results: Mapping[str, Any], name: str) -> str:
 
 
 def lacks_depth(results: Mapping[str, Any], name: str, measure: str) -> bool:
-    """Return whether a measure is of depth and the row's model imagines none."""
+    """Return whether a metric needs depth and the row's model imagines none."""
     about = results["about"]["rows"].get(name, {})
     return measure.startswith("depth") and about.get("depth") is False
 
 
 def cell(results: Mapping[str, Any], name: str, measure: str) -> Cell:
-    """Return a number with half of its interval; a dash if there is none."""
+    """Return the cell of a number with half of its interval; a dash if there is none."""
     entry = results["rows"][name]["measures"].get(measure)
     if entry is None or lacks_depth(results, name, measure):
         return Cell()
@@ -152,14 +154,14 @@ def best_of(results: Mapping[str, Any], names: Sequence[str], measure: str) -> s
         for name in names
         if name in results["about"]["rows"] and cell(results, name, measure).value is not None
     ]
-    if not known or measure == "src":  # a model that always shows one picture is consistent too
+    if not known or measure == "src":  # a model that always shows one image is consistent, too
         return ""
     lower = measure.split("/", 1)[0] in LOWER
     return (min if lower else max)(known)[1]
 
 
 def floor_of(results: Mapping[str, Any], measure: str) -> float | None:
-    """Return what the truth itself gets; None where that is not measured."""
+    """Return the score of the ground truth; None if not measured."""
     floors = results["floors"]
     if measure == "src" and "src[alex]" in floors:
         return floors["src[alex]"]["ceiling"]
@@ -168,7 +170,7 @@ def floor_of(results: Mapping[str, Any], measure: str) -> float | None:
 
 
 def place_floor(results: Mapping[str, Any], measure: str) -> float | None:
-    """Return what pictures of two different places get; None but for SRC."""
+    """Return the score of two different places; None except for SRC."""
     floors = results["floors"]
     return floors["src[alex]"]["floor"] if measure == "src" and "src[alex]" in floors else None
 
@@ -178,7 +180,7 @@ def scores_table(results: Mapping[str, Any], *, arrows: bool = False) -> Table:
 
     Args:
         results: the content of ``results.json``.
-        arrows: whether headings show by an arrow which direction is better.
+        arrows: whether headings have an arrow for the better direction.
     """
     names, columns = rows_of(results), columns_of(results)
     best = {measure: best_of(results, names, measure) for measure in columns}
@@ -207,7 +209,7 @@ def _bound(
     *,
     rule: bool = False,
 ) -> Row:
-    """Return a row of what the truth, or two different places, get."""
+    """Return a row with the scores of the ground truth or of two different places."""
     cells = [
         Cell(number_of(results, measure), COLUMNS[measure][1]) for measure in columns_of(results)
     ]
@@ -215,7 +217,7 @@ def _bound(
 
 
 def numbers_table(results: Mapping[str, Any]) -> Table:
-    """Return every number of the table, a line for each row and measure."""
+    """Return every number of the table, one line per row and metric."""
     lines = []
     for name in rows_of(results):
         found = results["rows"][name]
@@ -236,7 +238,7 @@ def numbers_table(results: Mapping[str, Any]) -> Table:
 
 
 def chart(results: Mapping[str, Any], measure: str = "psnr/seen") -> IntervalChart:
-    """Return the chart of a measure of every row with its interval."""
+    """Return the chart of a metric with the interval of every row."""
     known = {name: results["rows"][name]["measures"][measure] for name in rows_of(results)}
     if all(entry["mean"] is None for entry in known.values()):
         measure = "psnr/all"  # nothing was seen before
@@ -293,24 +295,25 @@ def _title(about: Mapping[str, Any]) -> str:
 
 
 def how(results: Mapping[str, Any]) -> str:
-    """Return in words how the numbers were made."""
+    """Return a paragraph on how the numbers were measured."""
     about = results["about"]
     equal, size = "equal steps", about["pixels"]
     if about["minutes"]:
         first, second = about["minutes"]
         clock = "processor " if about["clock"] == "processor" else ""
         times = sorted({row["times"] for row in about["rows"].values()} - {1})
-        but = "".join(f", {time:g} times as long where a row says so" for time in times)
+        but = "".join(f", {time:g} times as long for rows that say so" for time in times)
         equal = f"equal time ({first:g} + {second:g} {clock}minutes of training steps{but})"
     return (
         f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; "
-        f"pictures of {size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} "
+        f"images of {size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} "
         f"imagined frames in {about['houses']} {about['house']}s, {about['context']} "
         f"frames of context. Means over {about['house']}s; ± is half of "
-        f"the 95 % interval over {about['house']}s (bootstrap), of FVD and KVD over training seeds "
-        f"(Student's). Protocol {about['protocol_sha256'][:12]}. The pieces took "
-        f"{about['hours']['clock']:.1f} hours on the clock, added up, {about['hours']['cpu']:.1f} "
-        f"of the processor; {about['date']}."
+        f"the 95 % interval over {about['house']}s (bootstrap), for FVD and KVD over training "
+        "seeds "
+        f"(Student's). Protocol {about['protocol_sha256'][:12]}. Total wall-clock time "
+        f"{about['hours']['clock']:.1f} hours, processor time {about['hours']['cpu']:.1f} "
+        f"hours; {about['date']}."
     )
 
 
@@ -319,20 +322,21 @@ def _floors(results: Mapping[str, Any]) -> str:
     halves = [floors[kind]["half_clips"] for kind in SETS if floors.get(kind, {}).get("floor")]
     if halves:
         said.append(
-            f"FVD and KVD compare {halves[0]} imagined clips with the truth of as many others, "
-            "means over random halves, and so does their floor, the truth against itself."
+            f"FVD and KVD compare {halves[0]} imagined clips with the ground truth of as many "
+            "others, "
+            "averaged over random halves; their floor compares the ground truth with itself."
         )
     if "src[alex]" in floors:
         src = floors["src[alex]"]
         said.append(
-            f"SRC[alex]: the truth has {src['ceiling']:.1f}, two different places "
+            f"SRC[alex]: ground truth {src['ceiling']:.1f}, two different places "
             f"{src['floor']:.1f}."
         )
     return " ".join(said)
 
 
 def _unbeaten(results: Mapping[str, Any]) -> str:
-    """Log on which measures no trained row reaches what needs no network."""
+    """Return a sentence on metrics in which a method without a network beats all rows."""
     said = []
     for rival in ("reproject", "copy"):
         theirs = results["rows"].get(rival, {"measures": {}})["measures"]
@@ -378,7 +382,7 @@ def _cells_of(
 
 
 def _order_text(results: Mapping[str, Any]) -> str:
-    """Return the paper's order, step by step, with differences over pixels seen before."""
+    """Return the steps of the paper's order, with differences over pixels seen before."""
     if not results["order"]:
         return ""
     rows = []
@@ -389,16 +393,16 @@ def _order_text(results: Mapping[str, Any]) -> str:
     text = _markdown(["step of the paper's order", *STEP_HEADINGS], rows)
     return (
         "## The paper's order\n\nThe paper has no memory < image memory < no depth < 2D map < 3D "
-        "map. Each step here, paired. *None · attend* is ours: a "
-        "reader that was trained as long with nothing to read. All readers place what they read by "
-        "projection; the last step goes to the paper's own positions, a sinusoid. What a memory "
-        "adds shows in seen minus unseen pixels: what helps both alike is no memory.\n\n"
+        "map. Each step here, paired. *None · attend* is our control: a "
+        "reader without input, trained equally long. All readers use projective positions, except "
+        "the last step, which uses the paper's sinusoid. The effect of a memory is the difference "
+        "of seen minus unseen pixels: an improvement of both is not due to memory.\n\n"
         f"{PAIRED}\n\n{text}"
     )
 
 
 def mark_of(entry: Mapping[str, Any]) -> str:
-    """Return the mark of a difference; FVD and KVD, of sets, have p values over seeds alone."""
+    """Return the mark of a difference; FVD and KVD have p values only over seeds."""
     houses, seeds = entry.get("p_holm"), entry.get("p_seeds_holm")
     over_seeds = seeds is not None and seeds < ALPHA
     if "p" not in entry:
@@ -431,7 +435,7 @@ def _trainings(about: Mapping[str, Any]) -> str:
     for name, training in about["trainings"].items():
         described = about["rows"].get(name)
         took = "–" if training["seconds"] is None else f"{training['seconds']:.3f}"
-        size = described["parameters"] if described else 0  # without a reader the backbone trains
+        size = described["parameters"] if described else 0  # else the backbone is trained
         count = f"{size / 1e6:.2f} M" if size else "–"
         rows.append([name, count, took, str(training["steps"])])
     header = ["training", "parameters of the reader", "seconds a step", "steps"]

@@ -1,8 +1,8 @@
-"""The rows of Table 1: memories, each with the readers that apply, and the paper's ablations.
+"""The rows of Table 1: memories, each with the applicable readers, and the paper's ablations.
 
-A row is a memory's settings; all else is the same for all rows. What the paper's rows are called
-stands beside them. Rows whose reader has a size to choose get the one that comes nearest to the
-number of parameters of ``AttentionConfig`` in the base settings.
+A row is a memory's settings; everything else is the same for all rows. Each row states its name in
+the paper. If a reader has a size, it is chosen to match the number of parameters of
+``AttentionConfig`` in the base settings.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ from pewm_jax.readers.render import RenderConfig
 from pewm_jax.worlds import world_model
 
 POINTS, SURFELS = (0.4, 4), (0.12, 24)
-"""Size of a cell over the shortest side of a voxel, and capacity over that of voxels."""
+"""Size of a cell relative to the shortest side of a voxel, and capacity relative to that of
+voxels."""
 PATCHES = 64
-"""Tokens of a snapshot in the image memory, at least."""
+"""Smallest number of tokens per snapshot in the image memory."""
 PAPER_FORM, CONTROL = "voxel-attend-sinusoid", "none-attend"
-"""The paper's own form, and a reader of nothing."""
+"""The row of the paper's own form, and the row of a reader without input."""
 MOST_CELLS = 2**22
-"""Of a map with other cells than the table's."""
+"""Largest number of cells of a map in ablations."""
 NETWORK = "dinov2="
-"""Begins the value of the ablation of features that names a folder of DINOv2."""
+"""Prefix of values of the ablation of features that name a folder of DINOv2."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,14 +48,14 @@ class Row:
     """One row of the table.
 
     Attributes:
-        name: of its folders.
-        memory: what it remembers, and how it reads that.
+        name: name of its folders.
+        memory: the memory and its reader.
         depth: whether the model imagines depth.
-        paper: what the paper's Table 1 calls it; "" if it is not there.
-        times: how many times the others' training time it gets.
-        control: whether its reader is trained although there is nothing to read: what the readers'
-            parameters and their training do without a memory.
-        encoder: folder of the weights of its image encoder, where that is a network.
+        paper: its name in the paper's Table 1, or "".
+        times: its training time relative to that of other rows.
+        control: whether its reader is trained without input, to measure the effect of the reader's
+            parameters and training without a memory.
+        encoder: folder of the weights of its image encoder, if that is a network.
     """
 
     name: str
@@ -67,12 +68,12 @@ class Row:
 
     @property
     def reads(self) -> bool:
-        """Whether a reader is trained (stage 2); if not, the backbone is trained on."""
+        """Return whether a reader is trained (stage 2); else the backbone is trained further."""
         return self.memory.REMEMBERS or self.control
 
     @property
     def label(self) -> str:
-        """The row's name for people: memory, reader, what is unusual."""
+        """Return the row's display name: memory, reader, deviations."""
         kind, *rest = self.name.split("-")
         return f"{kind} · {', '.join(rest)}" if rest else kind
 
@@ -129,7 +130,7 @@ def _finer(
     scale: float,
     more: int,
 ) -> Memory:
-    """Return a memory of coloured points: cells are cubes, and the extent stays."""
+    """Return a memory of coloured points with cubic cells and the same extent."""
     side = round(scale * min(memory.cell_m), 4)
     sizes = zip(memory.cell_m, memory.cells, strict=True)
     cells = tuple(math.ceil(size * count / side) for size, count in sizes)
@@ -151,7 +152,7 @@ def _attend(base: Config) -> AttentionConfig:
 
 
 def _rendered(base: Config, memory: Memory) -> Memory:
-    """Return the memory read by rendering, with about as many parameters as by attention."""
+    """Return the memory read by rendering, with about as many parameters as attention has."""
     width = base.model.backbone.width
 
     def with_ratio(ratio: int) -> Memory:
@@ -164,7 +165,7 @@ def _rendered(base: Config, memory: Memory) -> Memory:
 
 
 def parameters(base: Config, memory: Memory) -> int:
-    """Return how many parameters a memory's reader has; those that stage 2 trains."""
+    """Return the number of parameters of a memory's reader, which stage 2 trains."""
     model = base.with_model(memory=memory).model
     shapes = jax.eval_shape(functools.partial(world_model.init, model), jax.random.key(0))
     return sum(leaf.size for leaf in jax.tree.leaves(shapes.get("memory", {})))
@@ -175,7 +176,7 @@ def _paper_form(base: Config) -> Memory:
 
 
 def _cell(base: Config, side: str) -> Memory:
-    """Another size of a cell on the ground; extent and height stay, smaller ones are more."""
+    """Return the memory with another cell size on the ground and the same extent and height."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     x, y, z = memory.cell_m
     scale = float(side) / x
@@ -183,14 +184,14 @@ def _cell(base: Config, side: str) -> Memory:
     room = math.ceil(memory.capacity / min(1.0, scale) ** 2)
     if room > MOST_CELLS:
         raise UserError(
-            f"cells of {side} m on the ground need a map of {room:,} of them, and {MOST_CELLS:,} "
-            "are the most that is tried: give a longer side."
+            f"cells of {side} m on the ground need a map of {room:,} cells, more than the limit of "
+            f"{MOST_CELLS:,}: use a longer side."
         )
     return dataclasses.replace(memory, cell_m=(x * scale, y * scale, z), cells=cells, capacity=room)
 
 
 def _extent(base: Config, side: str) -> Memory:
-    """Another extent of the map on the ground, metres."""
+    """Return the memory with another extent on the ground, metres."""
     if not 0 < float(side) < math.inf:
         raise ValueError(side)
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
@@ -200,19 +201,19 @@ def _extent(base: Config, side: str) -> Memory:
 
 
 def _tokens(base: Config, count: str) -> Memory:
-    """Another number of tokens that condition a clip."""
+    """Return the memory with another number of tokens that condition a clip."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     if int(count) > MOST_CELLS:
         raise UserError(
-            f"{count} tokens need a map of as many cells, and {MOST_CELLS:,} are the most that is "
-            "tried: give fewer."
+            f"{count} tokens need a map of as many cells, more than the limit of {MOST_CELLS:,}: "
+            "use fewer."
         )
     most = max(memory.capacity, int(count))
     return dataclasses.replace(memory, tokens=int(count), capacity=most)
 
 
 def _features(base: Config, kind: str) -> Memory:
-    """Other features: colours of patches, the codec's latents, a DINOv2's, or none (points)."""
+    """Return the memory with other features: patch colours, codec latents, DINOv2, or points."""
     memory = _as(base.model.memory, VoxelConfig, _attend(base))
     if kind.startswith(NETWORK):
         network = dinov2.load(Path(kind.removeprefix(NETWORK)))[0]
@@ -233,12 +234,12 @@ def _features(base: Config, kind: str) -> Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Ablation:
-    """A setting of the paper's map that is varied.
+    """An ablation of a setting of the paper's map.
 
     Attributes:
-        make: the memory with one of its values.
-        values: those tried unless others are given.
-        about: what it is, with its unit.
+        make: returns the memory with a value of the setting.
+        values: the default values.
+        about: description of the setting, with its unit.
     """
 
     make: Callable[[Config, str], Memory]
@@ -253,23 +254,23 @@ ABLATIONS: Mapping[str, Ablation] = {
     "features": Ablation(_features, ("colours", "latents", "points"), "what a cell holds"),
     "time": Ablation(lambda base, _: _paper_form(base), ("1", "4"), "times the others' time"),
 }
-"""The paper's ablations, of the voxel map read by attention; ``time`` trains the paper's own form
-(``PAPER_FORM``) longer, and a reader of nothing as long."""
+"""The paper's ablations of the voxel map read by attention; ``time`` trains the paper's own form
+(``PAPER_FORM``) longer, and a reader without input equally long."""
 
 
 def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row, ...]:
-    """Return the rows of an ablation; one that is a row of the table has its name.
+    """Return the rows of an ablation; a row that is also in the table has the same name.
 
     Args:
         base: the settings that all rows share.
-        name: of an ablation.
-        values: those to try; by default the ablation's own.
+        name: name of the ablation.
+        values: values to try; by default the ablation's own.
 
     Raises:
         UserError: there is no such ablation, or a value cannot be used.
     """
     if name not in ABLATIONS:
-        raise UserError(f"there is no ablation {name!r}; choose {', '.join(ABLATIONS)}.")
+        raise UserError(f"there is no ablation {name!r}; choose from {', '.join(ABLATIONS)}.")
     ablation = ABLATIONS[name]
     plain = _as(base.model.memory, VoxelConfig, _attend(base))
     found: list[Row] = []
@@ -289,7 +290,7 @@ def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row,
         words = f"{NETWORK[:-1]}_{Path(folder).name}" if folder else value
         row_name = start if own else f"{start}-{name}_{words}"
         found.append(Row(row_name, memory, times=times, encoder=folder))
-        if name == "time":  # beside it what so much time does to a reader of nothing
+        if name == "time":  # the control: a reader without input, trained equally long
             row_name = CONTROL if own else f"{CONTROL}-{name}_{words}"
             nothing = _as(base.model.memory, NoMemoryConfig, _attend(base))
             found.append(Row(row_name, nothing, times=times, control=True))

@@ -2,12 +2,12 @@
 
 Per clip: PSNR, SSIM, LPIPS and depth errors over pixels seen before, never seen and all; the logits
 of I3D of the observed and imagined frames, for FVD and KVD; and SRC of a walk half as far and back.
-Each row's numbers are a file beside its weights.
+Each row's scores are a file beside its weights.
 
 Scores can also be *recorded*: small files that a repository can hold, so a row that was trained and
 scored on one machine need not be trained again on another. The name of such a file contains a hash
 of the settings of the row's training and of its backbone's, of the data and the weights they start
-from, and of what is scored. If a row's own folder exists, that is used instead.
+from, and of the scoring. If a row has a local folder, that is used instead.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds.rollouts import load_finished
 
 NETWORKS = ("lpips_alex", "fvd", "kvd", "src[alex]", "dreamsim")
-"""Measures that need weights; those without weights are left out and reported."""
+"""Metrics that need weights; those whose weights are missing are skipped and reported."""
 SRC = "src[alex]"
 SHORTEST = 9
-"""Frames of the shortest clip that I3D takes."""
+"""Number of frames of the shortest clip that I3D accepts."""
 BASELINES = ("reproject", "copy")
 PROTOCOL, SCORES = "protocol.json", "scores"
 TRUTH = "the_truth"
@@ -55,16 +55,16 @@ Model = Callable[[Frames, Any, Camera, np.ndarray], Frames]
 
 @dataclasses.dataclass(frozen=True)
 class Scorer:
-    """The clips and measures that everything is scored by.
+    """The clips and metrics with which all rows are scored.
 
     Attributes:
-        config: the settings that all rows share, under the protocol.
-        protocol: what is scored.
+        config: the settings that all rows share, with those of the protocol.
+        protocol: the scored clips.
         batches: the clips.
-        nets: the measures that need weights, as far as they are at hand.
-        left_out: name → why a measure is left out.
-        name: a hash of all that scores depend on beside the weights.
-        log: shows a line.
+        nets: the available metrics that need weights.
+        left_out: name of a metric → reason why it is skipped.
+        name: a hash of all that scores depend on besides the weights.
+        log: prints a line.
     """
 
     config: Config
@@ -77,31 +77,31 @@ class Scorer:
 
     @property
     def house(self) -> str:
-        """What counts as a house: ``house``, a scene; or ``episode``, if there is one scene."""
+        """Return the unit of clustering: ``house`` (scene), or ``episode`` with one scene."""
         clips, episodes = self.protocol.clips, self.protocol.episodes
         return "house" if len({episodes[clip.episode].scene for clip in clips}) > 1 else "episode"
 
     @property
     def house_of_clip(self) -> np.ndarray:
-        """The number of each clip's ``house``."""
+        """Return the index of each clip's ``house``."""
         of = "scene" if self.house == "house" else "name"
         named = [getattr(self.protocol.episodes[c.episode], of) for c in self.protocol.clips]
         return np.unique(named, return_inverse=True)[1]
 
     @property
     def frames(self) -> int:
-        """The frames of a clip with the observed one."""
+        """Return the number of frames of a clip, including the observed one."""
         return self.config.model.clip.frames
 
     def row(self, config: Config, *, memory: bool) -> Arrays:
-        """Score a trained row, or find it scored.
+        """Score a trained row, or return its stored scores.
 
         Args:
-            config: of its training.
-            memory: whether it is given its memory; if not, an empty one.
+            config: configuration of its training.
+            memory: whether to use its memory or an empty one.
 
         Raises:
-            UserError: its weights are absent or damaged, or what it imagines is not finite.
+            UserError: its weights are missing or damaged, or an imagined value is not finite.
         """
         run = Path(config.train.run)
         cache = ResultCache.for_weights(run / SCORES, file_hash(run / WEIGHTS), self.name)
@@ -124,7 +124,7 @@ class Scorer:
         return cache.compute(piece, score)
 
     def _cache(self, out: Path) -> ResultCache:
-        """Return the cache of results that depend on no weights."""
+        """Return the cache of results that do not depend on weights."""
         return ResultCache.for_weights(out / SCORES, "no weights", self.name)
 
     def reprojection(self, out: Path) -> ReprojectChoice:
@@ -132,7 +132,7 @@ class Scorer:
         return choose_settings(self.config, self._cache(out), self.log)
 
     def baseline(self, name: str, out: Path) -> Arrays:
-        """Score ``reproject`` or ``copy``, which have no network, or find it scored."""
+        """Score ``reproject`` or ``copy``, or return the stored scores."""
         settings = self.reprojection(out).settings if name == "reproject" else None
 
         def imagine(context: Frames, control: Any, camera: Camera, seeds_B2: np.ndarray) -> Frames:
@@ -145,7 +145,7 @@ class Scorer:
         return self._cache(out).compute(piece, lambda: self._score(imagine, f"scoring {name}"))
 
     def truth(self, out: Path) -> Arrays:
-        """Return the truth's own logits, and the ceiling and floor of SRC."""
+        """Return the ground truth's logits, and the ceiling and floor of SRC."""
         return self._cache(out).compute(TRUTH, self._score_truth)
 
     def _score_truth(self) -> Arrays:
@@ -170,7 +170,7 @@ class Scorer:
         return values
 
     def _consistency(self, walks_CTHWC: np.ndarray) -> Arrays:
-        """Return SRC of the truth, and of each walk with the next clip's way back."""
+        """Return SRC of the ground truth, and of each walk with the next clip's return path."""
         out, back = (np.asarray(way) for way in ways(walks_CTHWC))
         size, compare = self.config.evaluate.batch, self.nets[SRC].compare
         found = {}
@@ -217,16 +217,16 @@ def open_scorer(
     log: Callable[[str], Any],
     weights: Mapping[str, str | Path] | None = None,
 ) -> Scorer:
-    """Fix the protocol before anything is trained, and read its clips.
+    """Fix the protocol before training, and read its clips.
 
     Args:
         config: the settings that all rows share.
-        out: the folder of the table; its ``protocol.json`` is written, or followed.
-        log: shows a line.
-        weights: measure → its file or folder of weights, for those that no package has.
+        out: the folder of the table; its ``protocol.json`` is written or, if it exists, used.
+        log: prints a line.
+        weights: metric → its file or folder of weights, for those that ship with no package.
 
     Raises:
-        UserError: the data are absent or have changed, or another protocol lies there.
+        UserError: the data are missing or have changed, or the folder contains another protocol.
     """
     out.mkdir(parents=True, exist_ok=True)
     protocol = protocols.write_protocol(config, out / PROTOCOL, log)
@@ -256,14 +256,14 @@ def open_scorer(
 def _measures(
     config: Config, weights: Mapping[str, str | Path] | None, clips: int
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the measures that need weights and can be taken, and why others cannot."""
+    """Return the available metrics that need weights, and the reasons why others are skipped."""
     nets, left_out = load_all(NETWORKS, weights)
     clip = config.model.clip
     small = min(clip.height, clip.width) < LEAST["alex"]
     for name in ("lpips_alex", SRC) if small else ():
         if nets.pop(name, None) is not None:
             size = f"{LEAST['alex']} pixels each way and these have {clip.width} × {clip.height}"
-            left_out[name] = f"{name} is left out: AlexNet needs pictures of {size}."
+            left_out[name] = f"{name} is left out: AlexNet needs images of {size}."
     if clip.frames % 2 == 0 and nets.pop(SRC, None) is not None:
         left_out[SRC] = f"{SRC} is left out: a walk half as far and back needs an odd clip.frames."
     for name in ("fvd", "kvd") if clip.frames < SHORTEST else ():
@@ -295,27 +295,27 @@ def _there_and_back(x_BT: Any, half: int) -> np.ndarray:
 
 FOLDER = "recorded"
 VERSION = 1
-"""Raise it when the code changes what is learnt or scored: older scores are then left aside."""
+"""Increase it when the code changes training or scoring: older scores are then ignored."""
 ELSEWHERE = ("train.start", "data.path")
-"""Folders, which may lie anywhere, in the settings of a training."""
+"""Settings of a training that are folders, whose location does not matter."""
 ADDED: Mapping[str, Any] = {
     "train.noise_key": "weights",
     "train.beta1": 0.9,
     "train.beta2": 0.999,
     "train.epsilon": 1e-8,
 }
-"""Settings that came later, with the values that stand for what was done before; with these they
-are left out of the name."""
+"""Settings added later, with the values that reproduce the earlier behaviour; with these values
+they are omitted from the name."""
 
 
 def recorded_path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: str) -> Path:
     """Return the file of a row's scores.
 
     Args:
-        study: what all rows share.
+        study: settings shared by all rows.
         row: the row.
-        seed: of its training.
-        steps: name of a row or backbone → steps.
+        seed: training seed.
+        steps: name of a row or backbone → number of steps.
         scored: hash of the protocol and the metrics (``Scorer.name``).
     """
     start = study.base.train.start
@@ -333,7 +333,7 @@ def recorded_path(study: Study, row: Row, seed: int, steps: Mapping[str, int], s
 
 
 def _settings(config: Config) -> dict[str, Any]:
-    """Return the settings that name a training's scores, as version 3 of the settings has them."""
+    """Return the settings that identify a training's scores, in the format of version 3."""
     found = identity(config) | {"version": 3}
     return {
         name: value
@@ -343,7 +343,7 @@ def _settings(config: Config) -> dict[str, Any]:
 
 
 def read_recorded(file: Path) -> dict[str, Arrays] | None:
-    """Return the scores in a file by name, or None if there is no whole one."""
+    """Return the scores in a file by name, or None if it is missing or damaged."""
     flat = ResultCache(file.parent, COMPRESSED).get(file.stem)
     if flat is None:
         return None
@@ -355,7 +355,7 @@ def read_recorded(file: Path) -> dict[str, Arrays] | None:
 
 
 def write_recorded(file: Path, found: Mapping[str, Arrays]) -> None:
-    """Write scores, name of a row → measure → numbers, unless the file holds them."""
+    """Write scores (row → metric → values), unless the file already contains them."""
     if _equal(read_recorded(file), found):
         return
     flat = {

@@ -1,13 +1,13 @@
 """The trainings of Table 1: a backbone for each seed, and from it every row, in equal time.
 
-A row with a memory trains its reader alone (stage 2). The row without one continues the training of
-its backbone. ``made_from.json`` beside a row's weights names the weights and the data that it was
-made from; a row that was made from others is refused.
+A row with a memory trains only its reader (stage 2). The row without one continues the training of
+its backbone. ``made_from.json`` beside a row's weights contains hashes of the weights and data it
+was trained from; a row trained from others is an error.
 
-Each training gets as many steps as its time allows. On a processor that is processor time, measured
-before the first training with all rows in turn, so that other jobs slow all of them alike; on an
+Each training gets as many steps as its time allows. On a CPU that is processor time, measured
+before the first training with all rows in turn, so that other jobs affect all rows equally; on an
 accelerator it is wall-clock time. Preparing clips, compiling and scoring do not count. The
-measurements are stored in ``plan.json`` by the settings they hold for, and are not repeated.
+measurements are stored in ``plan.json`` with the settings they are valid for, and are not repeated.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ Log = Callable[[str], Any]
 
 @dataclasses.dataclass(frozen=True)
 class Study:
-    """What all trainings of a table share.
+    """Settings shared by all trainings of a table.
 
     Attributes:
-        base: the settings; the folder of data is there.
-        out: the folder that everything is kept in.
+        base: the settings, including the data folder.
+        out: the output folder.
         minutes: processor minutes of training steps: a backbone's, and a row's.
-        steps: steps instead of minutes, for both; None for equal time.
+        steps: numbers of steps instead of minutes, for both; None for equal time.
     """
 
     base: Config
@@ -66,11 +66,11 @@ class Study:
         """Validate."""
         require(
             all(math.isfinite(value) and value > 0 for value in self.minutes),
-            f"minutes are {self.minutes}: give two numbers above 0, of a backbone and of a row.",
+            f"minutes are {self.minutes}: give two numbers above 0, for a backbone and for a row.",
         )
         require(
             self.steps is None or min(self.steps) >= 1,
-            f"steps are {self.steps}: give two whole numbers from 1 on, of a backbone and a row.",
+            f"steps are {self.steps}: give two integers of 1 or more, for a backbone and a row.",
         )
 
     def folder(self, name: str, seed: int) -> Path:
@@ -96,14 +96,14 @@ def backbone_of(base: Config, row: Row) -> Row:
 def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Config:
     """Return the settings of one training.
 
-    What goes on training a backbone gets the clips that the readers of this seed get, and not once
-    more those of its backbone: clips are chosen by the seed and by the stage's number.
+    A continued backbone gets the clips that the readers of this seed get, not those of its backbone
+    again: clips are selected by the seed and the stage's number.
 
     Args:
-        study: what all share.
+        study: shared settings.
         row: the row, or its backbone.
-        seed: of the training.
-        steps: of the only stage that is trained.
+        seed: training seed.
+        steps: number of steps of the only trained stage.
         start: the weights to start from.
     """
     base = study.base
@@ -128,21 +128,21 @@ def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Co
 
 
 def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], log: Log) -> Config:
-    """Train a row, after its backbone, or find them trained.
+    """Train a row and its backbone, unless they are trained already.
 
     Args:
-        study: what all share.
-        row: what to train.
-        seed: of the training.
-        steps: from ``planned``: name of a row or backbone → steps.
-        log: shows a line.
+        study: shared settings.
+        row: the row.
+        seed: training seed.
+        steps: from ``planned``: name of a row or backbone → number of steps.
+        log: prints a line.
 
     Returns:
         The settings of the row's training, whose folder is ``train.run``.
 
     Raises:
         UserError: the data do not fit, or a loss is not finite.
-        Interrupted: everything is saved; the same call goes on.
+        Interrupted: everything is saved; the same call resumes.
     """
     before = backbone_of(study.base, row)
     start = str(_start(study)) if study.base.train.start else ""
@@ -176,7 +176,7 @@ def _start_of(study: Study, row: Row, before: Row, seed: int) -> Path:
 
 
 def _require_same(config: Config) -> None:
-    """Refuse to go on with, or to take, what was made from other weights or data."""
+    """Raise an error if a row's folder was made from other weights or data."""
     run, start = Path(config.train.run), config.train.start
     now = {
         "start": file_hash(Path(shipped.find(start)) / WEIGHTS) if start else "",
@@ -192,13 +192,14 @@ def _require_same(config: Config) -> None:
     elif before != now:
         what = " and ".join(name for name in now if now[name] != before.get(name))
         raise UserError(
-            f"{run} was made from other weights or data ({what}) than there are now: delete it, or "
-            "name another folder by --out."
+            f"{run} was made from other weights or data ({what}) than the present ones: delete it, "
+            "or "
+            "choose another folder by --out."
         )
 
 
 def _start(study: Study) -> Path:
-    """Return the codec to start from, without a gate where the settings have none."""
+    """Return the codec to start from, without a gate if the settings have none."""
     source, folder = shipped.find(study.base.train.start), study.out / CODEC
     if getattr(study.base.model.codec, "gate", 0):
         return source
@@ -218,20 +219,20 @@ def _start(study: Study) -> Path:
 
 
 ROUNDS = 7
-"""Steps of each training that are timed, in turn; one more before them is not."""
+"""Number of timed steps of each training, in turn; one more step before them is not timed."""
 PLAN = "plan.json"
 UNREAD = "weights that are not read"
-"""Stands for the weights to start from where settings are only looked at."""
+"""Placeholder for the start weights when settings are only inspected."""
 Times = dict[str, float]
 
 
 def planned(study: Study, rows: Sequence[Row], log: Log) -> dict[str, Any]:
-    """Return how many steps each row and its backbone get; measured once.
+    """Return the number of steps of each row and its backbone; measured once.
 
-    Trainings that are timed later are timed beside one that was timed before, and scaled by it.
+    Trainings timed later are timed together with one that was timed before, and scaled by it.
 
     Returns:
-        By name: ``seconds`` that a step takes, None where steps are equal; and ``steps``.
+        By name: ``seconds`` per step, None for equal steps; and ``steps``.
 
     Raises:
         UserError: ``plan.json`` is damaged.
@@ -260,7 +261,7 @@ def _timed(study: Study, models: dict[str, Row], log: Log) -> Times:
     if not missing:
         return kept
     known = {model: row for model, row in models.items() if model in kept}
-    beside = dict(list(known.items())[-1:])  # a row rather than a backbone, where one is known
+    beside = dict(list(known.items())[-1:])  # preferably a row, not a backbone
     found = _measure(study, {**beside, **missing}, log)
     scale = next((kept[model] / found[model] for model in beside), 1.0)
     kept = _kept(path) | kept | {model: scale * found[model] for model in missing}
@@ -277,13 +278,14 @@ def _kept(path: Path) -> Times:
         return {}
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(
-            f"{path} is damaged ({error}): it says how long trainings are; restore it, or take "
+            f"{path} is damaged ({error}), but it defines the lengths of trainings: restore it, or "
+            "use "
             "another folder by --out."
         ) from None
 
 
 def _model(study: Study, row: Row) -> str:
-    """Return a hash of what the time of a row's step depends on."""
+    """Return a hash of all that the step time of a row depends on."""
     config = settings(study, row, 0, 1, start=UNREAD)
     assert isinstance(config.model, ModelConfig)
     facts = [configuration.to_dict(config.model), STAGES[0].settings(config).batch, row.reads]
@@ -291,12 +293,12 @@ def _model(study: Study, row: Row) -> str:
 
 
 def clock() -> Callable[[], float]:
-    """Return the clock that counts: the processor's, or on an accelerator the one on the wall."""
+    """Return the clock for training time: processor time, or wall-clock time on an accelerator."""
     return time.process_time if jax.default_backend() == "cpu" else time.perf_counter
 
 
 def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:
-    """Return the time of a step of each model, seconds: medians, the models in turn."""
+    """Return the median seconds per step of each model, measured in turn."""
     log(f"timing a step of {len(models)} trainings …")
     steps = {model: _compiled(study, row, log) for model, row in models.items()}
     taken: dict[str, list[float]] = {model: [] for model in steps}
@@ -310,14 +312,14 @@ def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:
     found = {model: statistics.median(each) for model, each in taken.items()}
     for model, seconds in found.items():
         spread = f"{min(taken[model]):.3f} to {max(taken[model]):.3f}"
-        log(f"  {models[model].name}: {seconds:.3f} s a step ({spread})")
+        log(f"  {models[model].name}: {seconds:.3f} s per step ({spread})")
     del steps
     gc.collect()
     return found
 
 
 def _compiled(study: Study, row: Row, log: Log) -> Callable[[], None]:
-    """Compile a row's training step; returns a function that does one step, on random weights."""
+    """Compile a row's training step; return a function that runs one step on random weights."""
     config = settings(study, row, 0, 1, start=UNREAD)
     stage, mesh = STAGES[1 if row.reads else 0], sharding.make_mesh(arranged=config.train.mesh)
     batch = next(iter(loader.clips(config, "train", seed=0, batch=stage.settings(config).batch)))

@@ -1,4 +1,4 @@
-"""Table 2 by one command: does a world model help to decide, and does its memory?
+"""Table 2 by one command: does a world model improve decisions, and does its memory?
 
 Every method gets the same tasks. Every decision is a file, so the same command resumes.
 """
@@ -31,8 +31,8 @@ from pewm_jax.studies.goals import Goal, open_goal
 from pewm_jax.types import Params
 
 WITHIN_M, WITHIN_DEG = 0.35, 45.0
-"""A goal is reached this near to it, and with a heading this near to its own: one step or one turn
-of the usual 0.25 m and 30° short, and no more."""
+"""Distance and heading difference within which a goal counts as reached: one step of 0.25 m or one
+turn of 30° short of it."""
 Log = Callable[[str], Any]
 
 
@@ -41,14 +41,14 @@ class Table2Config:
     """The settings of a table.
 
     Attributes:
-        tasks: how many.
-        houses: held-out houses, which tasks take in turn.
+        tasks: number of tasks.
+        houses: number of held-out houses, which tasks use in turn.
         proposals: numbers of a policy's proposals that are ranked.
-        plan: of the planner.
-        policy: its name.
-        cost: its name.
-        videos: tasks that are shown.
-        multiples: goals are so many times ``plan.actions`` actions away.
+        plan: settings of the planner.
+        policy: name of the policy.
+        cost: name of the cost.
+        videos: number of tasks shown as videos.
+        multiples: distances of goals, in multiples of ``plan.actions`` actions.
         none: a run that was trained without memory, or "".
     """
 
@@ -71,30 +71,31 @@ def run(
     cost: FrameCost,
     log: Log = print,
 ) -> Path:
-    """Let every method decide every task, and write the table.
+    """Run every method on every task, and write the table.
 
     Args:
-        model: a run folder, or the name of weights that come with the library.
-        out: the folder that everything is kept in.
+        model: a run folder, or the name of weights that ship with the library.
+        out: the output folder.
         study: the settings.
-        policy: that of their name.
-        cost: that of their name.
-        log: shows a line.
+        policy: the policy named in ``study``.
+        cost: the cost named in ``study``.
+        log: prints a line.
 
     Returns:
-        The path of the table in Markdown; beside it .tex, .csv, .png, videos and ``results.json``.
+        The path of the table in Markdown; in the same folder .tex, .csv, .png, videos and
+        ``results.json``.
 
     Raises:
-        UserError: the weights are absent, the folder holds decisions of other settings, a cost is
-            no number, or a house has no room.
+        UserError: the weights are missing, the folder contains decisions with other settings, a
+            cost is not finite, or a house is too small.
     """
     opened = open_run(model)
     config, params = opened.config, opened.params
     if not has_memory(opened):
-        raise UserError(f"{model} has no memory, and what a memory adds is the question.")
+        raise UserError(f"{model} has no memory, but the table measures the effect of a memory.")
     if study.plan.actions % (config.model.clip.frames - 1):
         raise UserError(
-            f"plans have {study.plan.actions} actions, and {model} imagines "
+            f"plans have {study.plan.actions} actions, but {model} imagines "
             f"{config.model.clip.frames - 1} frames at once: use a multiple."
         )
     about = dataclasses.asdict(study) | {
@@ -102,7 +103,7 @@ def run(
     }
     if config.model.clip.height != config.model.clip.width:
         size = f"{config.model.clip.width}×{config.model.clip.height}"
-        raise UserError(f"{model} imagines pictures of {size}, and Table 2 needs square ones.")
+        raise UserError(f"{model} imagines images of {size}, but Table 2 needs square ones.")
     require_same_inputs(out, about, "decisions", ADDED)
     cache = ResultCache(out, TABLE)
     none = open_run(study.none) if study.none else None
@@ -151,7 +152,8 @@ def run(
 
 
 ADDED = ("tasks", "videos", "policy", "proposals", "multiples", "none")
-"""Settings that may change between calls: decisions do not depend on them, or name them."""
+"""Settings that may change between calls: decisions do not depend on them, or contain them in their
+name."""
 
 
 def _folder(name: str, study: Table2Config, times: int, none: LoadedRun | None) -> str:
@@ -164,14 +166,13 @@ def _folder(name: str, study: Table2Config, times: int, none: LoadedRun | None) 
 
 
 def _require_alike(none: LoadedRun, opened: LoadedRun, name: str, model: str | Path) -> None:
-    """Refuse a model without memory that has a memory, or does not fit the other."""
+    """Raise an error if the model without memory has a memory, or does not fit the other."""
     if has_memory(none):
-        raise UserError(f"{name} was trained with a memory: name a run trained in stage 1 alone.")
+        raise UserError(f"{name} was trained with a memory: use a run trained only in stage 1.")
     one, other = none.config.model, opened.config.model
     if (one.clip, one.actions) != (other.clip, other.actions):
         raise UserError(
-            f"{name} imagines other clips or takes other steps than {model}: train it with the "
-            "same settings."
+            f"{name} has other clips or actions than {model}: train it with the same settings."
         )
 
 
@@ -194,7 +195,7 @@ def _decided(
     cost: FrameCost,
     study: Table2Config,
 ) -> dict[str, Any]:
-    """Return what a method chose, where it led, and how good that is."""
+    """Return a method's decision, the resulting poses and their scores."""
     began = time.perf_counter()
     blocks = len(goal.expert_N) // study.plan.action_block
     config = dataclasses.replace(study.plan, horizon=blocks)
@@ -211,10 +212,10 @@ def _decided(
 
 
 def _scored(goal: Goal, actions_N: np.ndarray) -> dict[str, float]:
-    """Return how near actions led to the goal, and by which way."""
+    """Return the scores of the poses along actions."""
     made, true = goal.walked(actions_N), goal.walk_T3
     reached = scores.success(made[-1], true[-1], WITHIN_M, WITHIN_DEG)
-    along = made[: len(true)]  # a closed loop may have gone on
+    along = made[: len(true)]  # a closed loop may have more actions
     return {
         "ate": scores.ate(true, along),
         "rpe": scores.rpe(true, along),
@@ -270,7 +271,7 @@ def _videos(
     params: Params,
     made: Mapping[str, list[dict[str, Any]]],
 ) -> list[Path]:
-    """Write videos of what was planned and what happened, side by side."""
+    """Write videos of the imagined plan and the real frames, side by side."""
     files = []
     for number in range(min(study.videos, study.tasks)):
         actions = np.array(made["mpc-memory"][number]["actions"])

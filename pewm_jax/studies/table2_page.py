@@ -38,7 +38,7 @@ PAPER = (
 )
 """The paper's Table 2 (arXiv 2505.05495): ATE, RPE, SIM; MPC after about 720 samples."""
 NOT_COMPARABLE = (
-    "The paper does not say how far its goals are, nor what its SIM is; its policy is a NoMaD "
+    "The paper specifies neither the distance of its goals nor its SIM; its policy is a NoMaD "
     "trained on its own walks. Only the order of the rows can be compared."
 )
 
@@ -53,8 +53,8 @@ def write(results: Mapping[str, Any], page: Path, videos: Sequence[Path]) -> Non
 
 
 def label(name: str) -> str:
-    """Return a method's name for people."""
-    what, _, mind = name.partition("-")
+    """Return a method's display name."""
+    what, _, predictor = name.partition("-")
     words = {
         "empty": "the model, empty memory",
         "none": "a model trained without memory",
@@ -65,10 +65,10 @@ def label(name: str) -> str:
     if what == "policy":
         return "policy alone"
     if what == "mpc":
-        return f"one plan, open loop · {words[mind]}"
+        return f"one plan, open loop · {words[predictor]}"
     if what == "loop":
-        return f"MPC, closed loop · {words[mind]}"
-    return f"ranking × {what.removeprefix('rank')} · {words[mind]}"
+        return f"MPC, closed loop · {words[predictor]}"
+    return f"ranking × {what.removeprefix('rank')} · {words[predictor]}"
 
 
 def scores_table(results: Mapping[str, Any], *, seconds: bool = False) -> Table:
@@ -76,7 +76,7 @@ def scores_table(results: Mapping[str, Any], *, seconds: bool = False) -> Table:
 
     Args:
         results: ``rows`` of the content of ``results.json``.
-        seconds: whether a column shows how long a decision takes.
+        seconds: whether to include a column with the time per decision.
     """
     header = ["method", *(heading for heading, _ in COLUMNS.values())]
     rows = [
@@ -119,7 +119,8 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
         scores_table(results, seconds=True).markdown(),
         *_farther(results),
         "## What the memory adds\n\nWith memory minus empty, paired by task, 95 % intervals over "
-        "houses; of errors less is better.\n\n" + Table.of(["method", *headings], gains).markdown(),
+        "houses; for errors lower is better.\n\n"
+        + Table.of(["method", *headings], gains).markdown(),
         f"## The curve of planning\n\n![SIM against samples]({stem}.png)",
         "## Beside the paper\n\n"
         + Table.of(["", "ATE", "RPE", "SIM"], theirs).markdown()
@@ -144,20 +145,21 @@ def _how(results: Mapping[str, Any]) -> str:
     return (
         f"{about['model']}; {results['tasks']} tasks in {results['houses']} held-out houses; the "
         f"goal is where a walk of {plan['horizon'] * plan['action_block']} actions ends. Policy: "
-        f"{about['policy']}; cost: {about['cost']} to the goal's picture; plans by CEM with "
+        f"{about['policy']}; cost: {about['cost']} to the goal image; plans by CEM with "
         f"{plan['candidates']} candidates, {plan['elites']} elites, {plan['rounds']} rounds. Open "
-        "loop: one plan, carried out whole. Closed loop: after each clip's actions the agent "
-        "observes what is really seen and plans the rest anew; at the end it may correct by one "
-        "more clip, where that is foreseen to cost less. ATE and RPE against that walk, unaligned; "
-        "SIM = 50 (max(0, 1 − what is left "
-        "/ the way) + 1 − heading error / π); success within "
+        "loop: one plan, executed completely. Closed loop: after each clip's actions the agent "
+        "observes the real frames and plans the remaining actions again; at the end it may execute "
+        "one more clip if that lowers the predicted cost. ATE and RPE against that walk, "
+        "unaligned; "
+        "SIM = 50 (max(0, 1 − remaining distance "
+        "/ distance) + 1 − heading error / π); success within "
         f"{about['within_m']:g} m and {about['within_deg']:g}°. Means over houses; ± is half of "
         f"the 95 % interval (bootstrap over houses). {about['date']}."
     )
 
 
 def numbers_table(results: Mapping[str, Any]) -> Table:
-    """Return every number, a line for each method and score."""
+    """Return every number, one line per method and score."""
     rows = []
     for name, found in results["rows"].items():
         for score in COLUMNS:
@@ -188,7 +190,7 @@ def chart(results: Mapping[str, Any]) -> LineChart:
 
 
 def video(file: Path, goal: Goal, config: Config, params: Params, actions_N: np.ndarray) -> None:
-    """Write what a plan imagines, what happened, and the walk to the goal, side by side."""
+    """Write the imagined plan, the real frames, and the walk to the goal, side by side."""
     state = worlds.start(config, params, goal.context)
     imagined = worlds.imagine(
         config, params, state, actions_N.astype(np.int32), jax.random.key(goal.number)

@@ -62,7 +62,7 @@ def test_every_command_has_help(command, capsys):
         (["colect", "x"], "did you mean collect?"),
         (["collect"], "Folder to write"),
         (["collect", "x", "--trian", "3"], "did you mean --train?"),
-        (["collect", "x", "--train", "many"], "--train needs a whole number"),
+        (["collect", "x", "--train", "many"], "--train needs an integer"),
         (["collect", "x", "--frames", "1"], "--frames is 1"),
         (["collect", "x", "--policy", "random"], "'random'"),
         (["collect", "x", "--scene", "nowhere.glb"], "nowhere.glb does not exist"),

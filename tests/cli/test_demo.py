@@ -76,10 +76,7 @@ def test_what_cannot_be_is_refused_before_anything_is_made(called):
     wrong = (
         (["--preset", "dmo"], "There is no preset 'dmo'"),
         (["--houses", "0"], "at least 1"),
-        *(
-            (["--preset", name], "square pictures")
-            for name in ("codec", "persist_tiny", "egowm_svd")
-        ),
+        *((["--preset", name], "square images") for name in ("codec", "persist_tiny", "egowm_svd")),
         (["--house", "3"], "did you mean --houses"),
     )
     for argv, says in wrong:

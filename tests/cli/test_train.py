@@ -170,12 +170,12 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
 @pytest.mark.parametrize(
     ("argv", "part"),
     [
-        ([], "Name a preset first: pewm-jax train demo"),
-        (["--train.seed", "1"], "Name a preset first"),
+        ([], "Give a preset first: pewm-jax train demo"),
+        (["--train.seed", "1"], "Give a preset first"),
         (["dmo"], "no preset 'dmo' (did you mean demo?"),
         (["tiny", "--train.stage1.stepz", "1"], "did you mean --train.stage1.steps?"),
         (["tiny", "--steps", "1"], "did you mean --train.stage1.steps?"),
-        (["tiny", "--train.seed", "abc"], "--train.seed needs a whole number, got 'abc'."),
+        (["tiny", "--train.seed", "abc"], "--train.seed needs an integer, got 'abc'."),
         (["tiny", "--train.ema", "abc"], "--train.ema needs a number, got 'abc'."),
         (["tiny", "--train.seed"], "--train.seed needs a value."),
         (["tiny", "--noise.target", "x1"], "--model.noise.target is 'x1': use x0, v, eps."),

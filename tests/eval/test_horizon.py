@@ -108,7 +108,7 @@ def test_cells_are_given_back_with_their_class_or_count_as_wrong(monkeypatch):
 
 def test_ends_that_make_no_windows_are_refused():
     for ends in (["600", "200"], ["8"]):
-        with pytest.raises(ConfigError, match="rising numbers"):
+        with pytest.raises(ConfigError, match="increasing numbers"):
             program.execute(["horizon", "runs/x", "--ends", *ends])
     with pytest.raises(ConfigError, match="RUN is missing"):
         program.execute(["horizon"])

@@ -174,5 +174,5 @@ def test_measures_that_cost_are_left_out_in_a_sentence(monkeypatch):
         selection.select_fvd("on", 5, accelerator=True)
     assert set(selection.select_revisits((), None, 10, 64)[0]) == {"mirror[psnr]"}
     assert "no encoder" in selection.select_revisits((), None, 64, 64)[1]
-    with pytest.raises(UserError, match="alex needs pictures of 31 pixels"):
+    with pytest.raises(UserError, match="alex needs images of at least 31 pixels"):
         selection.select_revisits(("alex",), None, 16, 16)

@@ -209,8 +209,8 @@ def test_only_this_machine_reaches_it_unless_told_otherwise_and_then_it_says_so(
 def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
     wrong = (
         ([], "MODEL is missing"),
-        (["runs/none"], "is no run"),
-        (["small", "--port", "a"], "whole number"),
+        (["runs/none"], "is not a run"),
+        (["small", "--port", "a"], "an integer"),
         (["small", "--scene", "a.glb", "--episode", "b"], "one place"),
     )
     for argv, says in wrong:

@@ -148,7 +148,7 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
     (tmp_path / "weights.safetensors").write_bytes(
         (folder / "policy" / "weights.safetensors").read_bytes()
     )
-    with pytest.raises(UserError, match="takes other steps than"):
+    with pytest.raises(UserError, match="uses other actions than"):
         study.run(folder / "world", tmp_path, tmp_path / "out", ERRAND, log=lambda _: None)
     short = dataclasses.replace(ERRAND, practice=Practice(walks=1, blocks=1))
     with pytest.raises(UserError, match="use more --blocks"):
@@ -156,7 +156,7 @@ def test_a_policy_and_a_world_of_other_steps_are_refused(made, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="is a file: choose a folder"):
         study.run(folder / "world", folder / "policy", tmp_path / "file", ERRAND)
-    with pytest.raises(UserError, match="trained no policy"):
+    with pytest.raises(UserError, match="contains no policy"):
         deciders.open_policy(folder / "world")
     with pytest.raises(UserError, match="train a policy first"):
         deciders.open_policy(tmp_path / "nothing")

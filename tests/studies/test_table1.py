@@ -82,7 +82,7 @@ def test_the_whole_table_is_made(made):
     for name in results["rows"]:
         assert f"\n| {table1_page.label(results, name)} | " in text
         assert np.isfinite(results["rows"][name]["measures"]["psnr/all"]["mean"])
-    assert "512 × 512 pictures of scanned houses" in text  # what is not comparable
+    assert "512 × 512 images of scanned houses" in text  # what is not comparable
     assert "lpips_alex is left out: " in text
     assert any(line.startswith("fvd is left out: ") for line in said)
     blind = next(line for line in text.splitlines() if "without depth |" in line)
@@ -429,7 +429,7 @@ def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
     assert f"| FVD-9f@{count // 2} | KVD-9f@{count // 2} |" in text
     assert f"the truth against itself | – | – | – | – | – | {score.floor.mean:.0f} |" in text
     assert (
-        f"SRC[alex]: the truth has 100.0, two different places {truth['src_floor'].mean():.1f}"
+        f"SRC[alex]: ground truth 100.0, two different places {truth['src_floor'].mean():.1f}"
         in text
     )
     assert "## Each row minus none · attend" in text
@@ -502,7 +502,7 @@ def test_the_walk_back_passes_the_same_cameras():
     ("argv", "words"),
     [
         (["--rows", "nothing"], "there are no rows nothing; choose of none, "),
-        (["--values", "3"], "values are of an ablation"),
+        (["--values", "3"], "values apply to an ablation"),
         (["--ablate", "cell", "--values", "wide"], "the ablation cell cannot take 'wide'"),
         (["--ablate", "cell", "--values", "0"], "the ablation cell cannot take '0'"),
         (["--ablate", "cell", "--values", "1e-4"], "cells of 1e-4 m on the ground need a map of"),
@@ -511,11 +511,11 @@ def test_the_walk_back_passes_the_same_cameras():
         (["--ablate", "time", "--values", "-4"], "the ablation time cannot take '-4'"),
         (["--minutes", "nan", "1"], "minutes are"),
         (["--steps", "0", "1"], "steps are"),
-        (["--seeds", "1", "1"], "give each training seed once"),
-        (["--seeds", "0", "-1"], "give each training seed once, one at least, from 0 on"),
-        (["--ablate", "cell", "--rows", "none"], "rows are of the table, and not of an ablation"),
-        (["--preset", "nomad"], "of a NomadWorldConfig, and Table 1 compares memories"),
-        (["--preset", "codec"], "of a CodecWorldConfig, and Table 1 compares memories"),
+        (["--seeds", "1", "1"], "give distinct training seeds"),
+        (["--seeds", "0", "-1"], "give distinct training seeds of 0 or more"),
+        (["--ablate", "cell", "--rows", "none"], "rows apply to the table, not to an ablation"),
+        (["--preset", "nomad"], "of a NomadWorldConfig, but Table 1 compares memories"),
+        (["--preset", "codec"], "of a CodecWorldConfig, but Table 1 compares memories"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):

@@ -64,7 +64,7 @@ def test_the_whole_table_is_made(made):
     assert text.count("\n| one plan, open loop · ") == 2 * 4 + 0
     assert text.count("\n| MPC, closed loop · ") == 2 * 4
     assert "## Goals 8 actions away" in text
-    assert "The paper does not say how far its goals are" in text
+    assert "The paper specifies neither the distance of its goals" in text
     with page.with_suffix(".csv").open() as file:
         assert {line["method"] for line in csv.DictReader(file)} == set(names)
     assert page.with_suffix(".tex").read_text().count(r"\\") == len(names) + 1
@@ -141,7 +141,7 @@ def test_only_the_mind_with_a_memory_sees_the_past():
 
 @pytest.mark.parametrize("wrong", [np.zeros((2, 3), int), np.zeros((2, 4)), np.full((2, 4), 3)])
 def test_proposals_that_are_none_are_refused(wrong):
-    with pytest.raises(UserError, match=r"give \(2, 4\) whole numbers below 3"):
+    with pytest.raises(UserError, match=r"give \(2, 4\) integers below 3"):
         deciders.proposed(lambda asked, count: wrong, task(0, actions=4), 2)
 
 
@@ -187,8 +187,8 @@ def test_ranking_takes_the_best_proposal():
         (["--policy", "nothing"], "--policy nothing is neither one of wander"),
         (["--policy", "json:nothing"], "json has no function nothing"),
         (["--tasks", "0"], "--tasks is 0"),
-        (["--proposals", "0"], "--proposals needs different numbers from 1 on"),
-        (["--proposals", "8", "8"], "--proposals needs different numbers from 1 on"),
+        (["--proposals", "0"], "--proposals needs distinct numbers of 1 or more"),
+        (["--proposals", "8", "8"], "--proposals needs distinct numbers of 1 or more"),
         (["--elites", "99"], "plan.elites is 99"),
     ],
 )
@@ -271,7 +271,9 @@ def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
         assert f"| {what} · a model trained without memory |" in text
         assert f"| {what} · reprojection, no network |" in text
     wrong = dataclasses.replace(errand, none=str(folder / "run"))
-    with pytest.raises(UserError, match="was trained with a memory: name a run trained in stage 1"):
+    with pytest.raises(
+        UserError, match="was trained with a memory: use a run trained only in stage 1"
+    ):
         table2.run(
             folder / "run", tmp_path / "o", wrong, deciders.wanderer, costs.Pixels(), lambda _: None
         )
@@ -279,5 +281,5 @@ def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
 
 @pytest.mark.parametrize("far", [["2"], ["1", "1"], ["3", "1"], ["0"]])
 def test_distances_of_goals_that_cannot_be_are_refused(far):
-    with pytest.raises(ConfigError, match="--multiples needs growing numbers from 1 on"):
+    with pytest.raises(ConfigError, match="--multiples needs increasing numbers of 1 or more"):
         program.execute(["table2", "--multiples", *far])
