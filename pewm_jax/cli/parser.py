@@ -61,7 +61,7 @@ class Arguments:
         groups: dataclasses whose fields become flags, each with its default; None for the default
             of the class itself.
         description: the first paragraph of the help; by default the docstring of the first group.
-        epilog: text under the help, printed as it is.
+        epilog: text after the help, printed verbatim.
         hint: the command whose ``--help`` lists the settings, for error messages.
         renamed: earlier names of flags, with the present ones.
     """

@@ -78,7 +78,7 @@ def convert(
         src: see ``read``.
         dst: the folder to create.
         dtype: dtype of the stored parameters; by default the source's.
-        log: called with a line about what was imported.
+        log: called with a line that describes the import.
 
     Raises:
         UserError: ``src`` cannot be read, or ``dst`` exists.

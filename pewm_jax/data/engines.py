@@ -229,7 +229,7 @@ def require(config: CollectConfig) -> None:
     """Check that the engine can be used, before any file is written.
 
     Raises:
-        UserError: Ray is not installed, or nothing answers at the address.
+        UserError: Ray is not installed, or no cluster responds at the address.
     """
     if config.engine != "ray":
         return

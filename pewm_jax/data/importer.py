@@ -86,7 +86,7 @@ class ImportConfig:
     OpenCV), `half` is 0.5."""
     depth_scale: float = 1000.0
     """Value of a depth image that means one metre: 1000 for millimetres, 5000 for TUM. The largest
-    16-bit value, 65535, means no measurement whatever the scale."""
+    16-bit value, 65535, means no measurement, regardless of the scale."""
     max_depth: float = DEPTH_LIMIT_M
     """Depths beyond this become "no measurement", metres. By default all depths that the format can
     store are kept; give the range of the sensor, such as 10, to drop unreliable depths."""

@@ -2,7 +2,7 @@
 
 A scene is built once. The colours, texture coordinates and baked light of a triangle are stored as
 one row, affine in the barycentric coordinates of a hit, so that shading needs one gather per pixel.
-``read_surface`` reads the positions and colours of one mesh, whatever kind of colours it has.
+``read_surface`` reads the positions and colours of one mesh, with any kind of colours.
 """
 
 from __future__ import annotations

@@ -107,7 +107,7 @@ def imagine_walks(
         config: the experiment.
         params: its weights.
         walks: walks of equal length.
-        memory: False goes on from the last picture alone, clip after clip.
+        memory: if False, each clip is imagined only from the last frame of the previous one.
         known: whether a ``persist`` world starts from the recorded grid of the present frame.
         label: label of the progress line.
     """

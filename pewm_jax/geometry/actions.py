@@ -125,7 +125,8 @@ def there_and_back(actions_T3: Array) -> Array:
     Args:
         actions_T3: (..., T, 3) planar actions.
 
-    (..., 2 T, 3): the pose after k actions equals the pose after 2 T − k.
+    Returns:
+        (..., 2 T, 3): the pose after k actions equals the pose after 2 T − k.
     """
     out = jnp.asarray(actions_T3)
     turn = -out[..., 2:]

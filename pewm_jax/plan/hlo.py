@@ -70,7 +70,7 @@ class Product:
 
     Attributes:
         label: JAX's name for its place in the program.
-        flops: FLOPs of all its runs.
+        flops: FLOPs of all its executions.
     """
 
     label: str

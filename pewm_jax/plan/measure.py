@@ -131,7 +131,7 @@ def virtual(count: int) -> Sequence[Any]:
     """Return virtual CPU devices; call it before JAX uses any device.
 
     Raises:
-        UserError: JAX already uses devices, and too few.
+        UserError: JAX already uses devices, but too few.
     """
     try:
         jax.config.update("jax_platforms", "cpu")

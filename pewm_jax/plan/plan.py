@@ -72,7 +72,7 @@ def show(config: Config, launch: Launch, log: Callable[[str], None] = print) -> 
 
     Raises:
         ConfigError: the chip is unknown, or the mesh does not fit the devices or the batch.
-        UserError: JAX already uses devices, and too few.
+        UserError: JAX already uses devices, but too few.
     """
     chip = chips.named(launch.chip)
     sizes = MeshSizes(*config.train.mesh.shape(launch.devices))

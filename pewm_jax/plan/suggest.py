@@ -86,8 +86,8 @@ class Prediction:
         sent: bytes that a device sends, by (kind, axis of the mesh).
         waiting_s: seconds of communication that does not overlap with computation.
         step_s: seconds of a step.
-        needed_flops: FLOPs that a step needs, all devices together.
-        executed_flops: FLOPs that one device executes, with what is recomputed.
+        needed_flops: FLOPs that a step needs, over all devices.
+        executed_flops: FLOPs that one device executes, including recomputation.
         mfu: model FLOPs utilization: needed FLOPs over the peak FLOPs of all devices in that time.
         clips_per_s: clips per second.
     """

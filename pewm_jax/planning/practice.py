@@ -221,7 +221,7 @@ class ImaginedEnvironment:
         config: the world.
         params: its weights.
         seen: posed RGB-D frames with which it starts.
-        memory: False ignores what it remembers.
+        memory: if False, the world's memory is not used.
     """
 
     def __init__(self, config: Config, params: Params, seen: Frames, *, memory: bool = True):

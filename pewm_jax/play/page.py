@@ -177,7 +177,7 @@ class Page:
             follow.on_update(lambda _: setattr(self._map, "follow", follow.value))
             ceiling = gui.add_checkbox("Show ceilings", initial_value=False)
             ceiling.on_update(lambda _: self._redraw("ceiling", ceiling.value))
-            tint = gui.add_checkbox("Mark what was imagined", initial_value=False)
+            tint = gui.add_checkbox("Mark imagined points", initial_value=False)
             tint.on_update(lambda _: self._redraw("tint", tint.value))
             above = gui.add_button("Look from above", icon=viser.Icon.EYE)
             above.on_click(lambda _: self._map.look_from_above())

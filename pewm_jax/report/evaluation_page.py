@@ -40,7 +40,7 @@ INTRODUCTION = (
 )
 HOWS = {
     "memory": "with its 3D map, and with the same weights and an empty map",
-    "model": "it has no memory and sees only the last picture",
+    "model": "it has no memory and sees only the last frame",
 }
 """How the model imagines, by the key of its own row."""
 TITLES = {

@@ -73,11 +73,12 @@ def run(
 ) -> Path:
     """Let a policy practise in every house, and measure it before and after.
 
-    model: a run folder, or the name of weights that ship with the library.
-    policy: the run of a NoMaD.
-    out: the output folder; the same call resumes.
-    study: the settings.
-    log: prints a line.
+    Args:
+        model: a run folder, or the name of weights that ship with the library.
+        policy: the run of a NoMaD.
+        out: the output folder; the same call resumes.
+        study: the settings.
+        log: prints a line.
 
     Returns:
         The path of the table in Markdown; in the same folder .png and ``results.json``.

@@ -16,20 +16,18 @@ depth_mae        lower  mean error of depth, m; it takes depths (B, T, H, W) ins
 depth_rel        lower  likewise, divided by the true depth
 dreamsim         lower  DreamSim (0.2, ensemble), averaged over a clip's frames
 fvd              lower  Fréchet distance of the 400 logits of I3D; 9 frames or more; with its floor
-kvd              lower  kernel distance of the same; unbiased in the number of clips; may be
-negative src              higher clips that go out and return: cosine × 100 of DINOv2 features of
-both visits
+kvd              lower  kernel distance of the same; no bias by the number of clips; may be below 0
+src              higher clips that go out and return: cosine × 100 of DINOv2 features of both visits
                         of a place, in the imagined clip only (of the ground truth only the shape is
                         used); with its floor and ceiling
 src[alex]        higher the same with LPIPS's AlexNet as the encoder; and src[vgg]
-mirror[METRIC]   as     clips that go out and return: the return path against the way out by
-                 METRIC ``psnr``, ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with floor and ceiling
+mirror[METRIC]   as     clips that go out and return: the way back against the way out by ``psnr``,
                  METRIC ``ssim``, ``lpips_alex`` or ``lpips_vgg``; with its floor and ceiling
 ================ ====== ===========================================================================
 
-Modules: ``images`` (PSNR, SSIM, depth, and errors over seen and unseen pixels,
-``error_sums``), ``perceptual`` (LPIPS, DreamSim), ``videos`` (FVD, KVD), ``revisits`` (SRC, the
-mirror test), ``structure`` (SCS). ``selection`` selects those of a report.
+Modules: ``images`` (PSNR, SSIM, depth, and errors over seen and unseen pixels, ``error_sums``),
+``perceptual`` (LPIPS, DreamSim), ``videos`` (FVD, KVD), ``revisits`` (SRC, the mirror test),
+``structure`` (SCS). ``selection`` selects those of a report.
 """
 
 from __future__ import annotations
