@@ -69,7 +69,7 @@ def run(settings: Settings) -> None:
     opened = open_run(settings.run)
     others = [(name, open_run(name)) for name in settings.beside]
     runtime.cache_compilation(opened.home.parent)
-    facts, videos = _measured(settings, opened, others)
+    facts, videos = _measure(settings, opened, others)
     facts["protocol"] = {
         "run": settings.run,
         "weights_sha256": opened.weights_hash,
@@ -84,7 +84,7 @@ def run(settings: Settings) -> None:
     print(f"report: {page}")
 
 
-def _measured(
+def _measure(
     settings: Settings, opened: Any, others: Sequence[tuple[str, Any]]
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the measurements, and (B, T, H, W, 3) frames by method, ground truth first.
@@ -114,7 +114,7 @@ def _measured(
     chosen = [episodes[k] for k in range(settings.walks)]
     require_same_cells(config.model, chosen[0])
     walks = [horizon.read_walk(one, first, ends[-1], settings.context) for one in chosen]
-    tried = _tried(settings, chosen, first)
+    tried = _trial_walks(settings, chosen, first)
     of_voxels = isinstance(config.model, PersistConfig)
     if tried:  # fail before hours of imagining
         if not of_voxels:
@@ -144,7 +144,7 @@ def _measured(
     return facts, {"truth": truth, **made}
 
 
-def _tried(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
+def _trial_walks(settings: Settings, chosen: Sequence[Any], first: int) -> list[Any]:
     """Return walks for the trials, spread over the episodes, including spare ones."""
     if not settings.trials:
         return []

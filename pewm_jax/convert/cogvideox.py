@@ -247,7 +247,7 @@ def export(
     imported = (src / "transformer").is_dir()
     with output.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
-            params = _imported(src, network) if imported else _run(src, network, record)
+            params = _imported_params(src, network) if imported else _run(src, network, record)
             values = record[network.folder]
             pipeline.write_published(network, values, params, folder / network.folder, dtype)
             del params
@@ -272,7 +272,7 @@ def _origin(src: Path) -> Path:
     return here
 
 
-def _imported(src: Path, network: Network) -> Params:
+def _imported_params(src: Path, network: Network) -> Params:
     load = load_transformer if network is TRANSFORMER else load_vae
     return load(src)[1]
 

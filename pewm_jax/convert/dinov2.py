@@ -114,10 +114,10 @@ def open_source(src: Path) -> Source:
         src = pickled[0]
     if not src.is_file():
         raise UserError(f"{src} does not exist; give a transformers folder or a DINOv2 state dict.")
-    return _unpickled(src) if src.suffix in _PICKLED else sources.open_file(src)
+    return _read_state_dict(src) if src.suffix in _PICKLED else sources.open_file(src)
 
 
-def _unpickled(path: Path) -> Source:
+def _read_state_dict(path: Path) -> Source:
     """Read a state dict saved by torch, without executing code in it."""
     try:
         import torch  # noqa: PLC0415 - an extra: only these files need it

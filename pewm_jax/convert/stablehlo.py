@@ -89,7 +89,7 @@ def export(
         UserError: ``dst`` exists; the run is missing or damaged; a count or platform is invalid; or
             the check fails.
     """
-    _require_sensible(run, clips, frames, platforms)
+    _check_arguments(run, clips, frames, platforms)
     with output.new_folder(dst) as folder:
         log(f"reading {run} …")
         config, params = rollouts.load_finished(run)
@@ -205,12 +205,12 @@ def _entry(name: str, program: Program, exported: jax.export.Exported) -> dict[s
         "file": f"{name}.jaxexport",
         "meaning": program.meaning,
         "platforms": list(exported.platforms),
-        "inputs": _described(program.inputs),
-        "outputs": _described(outputs),
+        "inputs": _describe_arrays(program.inputs),
+        "outputs": _describe_arrays(outputs),
     }
 
 
-def _described(arrays: Arrays) -> list[dict[str, Any]]:
+def _describe_arrays(arrays: Arrays) -> list[dict[str, Any]]:
     return [
         {"name": name, "shape": list(x.shape), "dtype": np.dtype(x.dtype).name}
         for name, x in arrays.items()
@@ -223,7 +223,7 @@ def _actions(config: Config) -> dict[str, list[float]]:
     return {name: table[i].tolist() for i, name in enumerate(action_geometry.NAMES)}
 
 
-def _require_sensible(run: Path, clips: int, frames: int | None, platforms: Sequence[str]) -> None:
+def _check_arguments(run: Path, clips: int, frames: int | None, platforms: Sequence[str]) -> None:
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; give a run made by train.py.")
     for name, count in (("clips", clips), ("frames", 1 if frames is None else frames)):

@@ -83,12 +83,12 @@ def example(signature, seed=0):
     for entry in signature["programs"].values():
         for item in entry["inputs"]:
             if item["name"] not in returned:
-                values[item["name"]] = _made_up(rng, item)
+                values[item["name"]] = _random_input(rng, item)
         returned |= {item["name"] for item in entry["outputs"]}
     return values
 
 
-def _made_up(rng, item):
+def _random_input(rng, item):
     name, shape, dtype = item["name"].split("/")[-1], tuple(item["shape"]), item["dtype"]
     level = [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1], [0, 0, 0, 1]]
     known = {"key": key(0), "intrinsics_4": [8, 8, 8, 8], "world_from_camera": level}

@@ -60,13 +60,17 @@ def _encode(
     try:
         tokenize = transformers.AutoTokenizer.from_pretrained(tokenizer, local_files_only=True)
     except (OSError, ValueError, KeyError, TypeError, ImportError, AttributeError) as error:
-        raise UserError(f"{tokenizer} cannot be read as a tokenizer ({_first(error)}).") from None
+        raise UserError(
+            f"{tokenizer} cannot be read as a tokenizer ({_first_sentence(error)})."
+        ) from None
     try:
         model, report = transformers.T5EncoderModel.from_pretrained(
             encoder, local_files_only=True, dtype="auto", output_loading_info=True
         )
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise UserError(f"{encoder} cannot be read as a T5 encoder ({_first(error)}).") from None
+        raise UserError(
+            f"{encoder} cannot be read as a T5 encoder ({_first_sentence(error)})."
+        ) from None
     wrong = {*report["missing_keys"], *report["unexpected_keys"]}
     if wrong:
         raise UserError(
@@ -97,7 +101,7 @@ def _encode(
     return out
 
 
-def _first(error: Exception) -> str:
+def _first_sentence(error: Exception) -> str:
     """Return the first sentence of a library's message."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[0].rstrip(".:")

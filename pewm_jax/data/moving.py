@@ -105,7 +105,7 @@ def moving_house(seed: int, agent_height_m: float) -> MovingHouse:
         leaves, width, free = hang_leaves(scene, free, draw, (x0, y0, x1, y1))
         moves += leaves
         pieces += [door_leaf(draw, width)] * len(leaves)
-    opened = _placed(_parts(pieces), _open_poses(moves)) if moves else None
+    opened = _place_parts(_parts(pieces), _open_poses(moves)) if moves else None
     grid = navigable(_concatenate(scene, opened), agent_height_m=agent_height_m)
     for room in scene.metadata["rooms"]:
         way = _robot_path(grid, rng, room, scene.metadata["doorways"])
@@ -118,14 +118,14 @@ def moving_house(seed: int, agent_height_m: float) -> MovingHouse:
 def parts_at(moving: MovingHouse, world_from_part_P44: np.ndarray) -> Scene:
     """Return the parts alone as a scene, at their poses of one frame."""
     assert moving.parts is not None
-    return _placed(moving.parts, world_from_part_P44)
+    return _place_parts(moving.parts, world_from_part_P44)
 
 
 def part_at(moving: MovingHouse, number: int, world_from_part_44: np.ndarray) -> Scene:
     """Return one part alone as a scene, at a pose; the scene must not be rendered."""
     assert moving.parts is not None
     poses = np.broadcast_to(world_from_part_44, (len(moving.moves), 4, 4))
-    whole, mine = _placed(moving.parts, poses), moving.parts.object_F == number
+    whole, mine = _place_parts(moving.parts, poses), moving.parts.object_F == number
     return dataclasses.replace(
         whole,
         faces_F3=whole.faces_F3[mine],
@@ -230,7 +230,7 @@ def _parts(pieces: list[Piece]) -> Scene:
     return dataclasses.replace(made, vertices_V3=vertices)
 
 
-def _placed(parts: Scene, world_from_part_P44: np.ndarray) -> Scene:
+def _place_parts(parts: Scene, world_from_part_P44: np.ndarray) -> Scene:
     """Move every part of a scene to its pose."""
     pose = world_from_part_P44[_part_of_vertex(parts)]
     vertices = np.einsum("vij,vj->vi", pose[:, :3, :3], parts.vertices_V3) + pose[:, :3, 3]

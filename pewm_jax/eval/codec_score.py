@@ -76,7 +76,7 @@ def score(
         scenes.setdefault(episode.scene, []).append(_mean_of_frames(found))
     sizes = sorted({f"{episode.width}×{episode.height}" for episode in episodes})
     numbers = {
-        name: _over_scenes([[one[name] for one in scene] for scene in scenes.values()])
+        name: _mean_over_scenes([[one[name] for one in scene] for scene in scenes.values()])
         for name in next(iter(scenes.values()))[0]
     }
     result = {
@@ -142,7 +142,7 @@ def _mean_of_frames(found: Mapping[str, np.ndarray]) -> dict[str, float]:
     return means
 
 
-def _over_scenes(scenes: list[list[float]]) -> dict[str, float | None]:
+def _mean_over_scenes(scenes: list[list[float]]) -> dict[str, float | None]:
     """Average episodes, then scenes; None if there is nothing to average."""
     means = np.array([np.mean(scene) for scene in scenes])
     means = means[np.isfinite(means)]

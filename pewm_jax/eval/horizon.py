@@ -119,7 +119,7 @@ def imagine_walks(
         state = _start_from_grids(config, params, walks)
     else:
         start = jax.jit(jax.vmap(functools.partial(worlds.start, model), (None, 0)))
-        state = start(params, _stacked([walk.context for walk in walks]))
+        state = start(params, _stack([walk.context for walk in walks]))
     actions = np.stack([walk.actions_T3 for walk in walks])
     keys = jax.random.split(jax.random.key(0), len(walks))
     return _in_chunks(
@@ -127,7 +127,7 @@ def imagine_walks(
         each,
         label,
         state,
-        lambda state, at: imagine(params, state, actions[:, at : at + each], _folded(keys, at)),
+        lambda state, at: imagine(params, state, actions[:, at : at + each], _fold_keys(keys, at)),
     )
 
 
@@ -137,7 +137,7 @@ def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) 
     render = functools.partial(persist.render_true, model)
     render = jax.jit(jax.vmap(render, (None, 0, 0, 0, 0, 0)))
     state = _start_from_grids(config, params, walks)
-    whole: Any = _stacked(
+    whole: Any = _stack(
         [
             (Control(walk.camera, walk.actions_T3), walk.classes_TXYZ, walk.origin_T3)
             for walk in walks
@@ -147,7 +147,7 @@ def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) 
 
     def made(state: Any, at: int) -> Any:
         part = jax.tree.map(lambda x: x[:, at : at + CHUNK], whole)
-        return render(params, state, *part, _folded(keys, at))
+        return render(params, state, *part, _fold_keys(keys, at))
 
     count = walks[0].actions_T3.shape[0]
     return _in_chunks(count, CHUNK, "rendering true voxels", state, made)
@@ -155,7 +155,7 @@ def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) 
 
 def _start_from_grids(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> Any:
     """Return the worlds that start from the recorded grids of the present frames."""
-    context = _stacked([jax.tree.map(lambda x: x[-1:], walk.context) for walk in walks])
+    context = _stack([jax.tree.map(lambda x: x[-1:], walk.context) for walk in walks])
     firsts = [walk.first for walk in walks if walk.first is not None]
     cells, corners = (np.stack(part) for part in zip(*firsts, strict=True))
     start = functools.partial(persist.start_in, config.model)
@@ -212,9 +212,9 @@ def _in_chunks(
     return np.concatenate(parts, 1)
 
 
-def _stacked(trees: Sequence[Any]) -> Any:
+def _stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: np.stack(x), *trees)
 
 
-def _folded(keys: Any, at: int) -> Any:
+def _fold_keys(keys: Any, at: int) -> Any:
     return jax.vmap(jax.random.fold_in, (0, None))(keys, jnp.uint32(at))

@@ -79,8 +79,8 @@ def roll_long(
                 if loaded is None or loaded[0] != first:
                     some, cameras = choices[first : first + size], methods.model.cameras
                     loaded = first, load_batch(config, episodes, some, first, cameras=cameras)
-                batch, here = loaded[1], _shown(shown, first, len(choices), size)
-                yield (method, first), _roll(config, methods, method, batch, here, lpips)
+                batch, here = loaded[1], _shown_count(shown, first, len(choices), size)
+                yield (method, first), _roll_batch(config, methods, method, batch, here, lpips)
                 meter.advance(count * batch.real)
         log(meter.summary())
 
@@ -91,13 +91,13 @@ def roll_long(
         cache=cache,
         what="long rollouts",
         is_usable=lambda key, arrays: (
-            len(arrays["rgb"]) >= _shown(shown, key[1], len(choices), size)
+            len(arrays["rgb"]) >= _shown_count(shown, key[1], len(choices), size)
         ),
         workers=workers(),
         is_light=lambda key: key[0] not in SAMPLED,
     )
     kept = {
-        method: _joined([found[method, first] for first in starts], shown)
+        method: _concatenate([found[method, first] for first in starts], shown)
         for method in methods.names
     }
     sums = {method: piece["sums"][None] for method, piece in kept.items()}
@@ -105,19 +105,19 @@ def roll_long(
     return LongRollouts(Scored(choices, sums), chain, shown, kept)
 
 
-def _shown(shown: int, first: int, rollouts: int, size: int) -> int:
+def _shown_count(shown: int, first: int, rollouts: int, size: int) -> int:
     """Return the number of rollouts of a batch to display."""
     return min(max(shown - first, 0), size, rollouts - first)
 
 
-def _joined(parts: Sequence[dict[str, np.ndarray]], shown: int) -> dict[str, np.ndarray]:
+def _concatenate(parts: Sequence[dict[str, np.ndarray]], shown: int) -> dict[str, np.ndarray]:
     """Concatenate batches; keep at most ``shown`` rollouts for display."""
     joined = {key: np.concatenate([part[key] for part in parts if key in part]) for key in parts[0]}
     every = ("sums", "occupied")
     return {key: array if key in every else array[:shown] for key, array in joined.items()}
 
 
-def _roll(
+def _roll_batch(
     config: Config,
     methods: Methods,
     method: str,

@@ -144,10 +144,10 @@ def mirror_test(
                     other = None
                     if len(choices) > 1:
                         other = _there_and_back(config, episodes, others, first, True)
-                    made = _of_truth(batch, other, measures)
+                    made = _truth_metrics(batch, other, measures)
                 else:
                     frames = batch.imagine(methods, method, seed)[2]
-                    made = _of_model(batch, frames, measures)
+                    made = _model_metrics(batch, frames, measures)
                 yield (method, first), {key: array[: batch.real] for key, array in made.items()}
                 meter.advance(2 * out * batch.real)
         log(meter.summary())
@@ -206,7 +206,7 @@ def _there_and_back(
     return Batch(context, whole, control, numbers, None, None, real=len(choices))
 
 
-def _of_truth(
+def _truth_metrics(
     batch: Batch, other: Batch | None, measures: Mapping[str, Revisit]
 ) -> dict[str, np.ndarray]:
     """Return the ceilings and, given the paths of other rollouts, the floors."""
@@ -218,7 +218,7 @@ def _of_truth(
     return {name: np.asarray(array) for name, array in made.items()}
 
 
-def _of_model(
+def _model_metrics(
     batch: Batch, frames: Frames, measures: Mapping[str, Revisit]
 ) -> dict[str, np.ndarray]:
     """Return the metrics of imagined paths, and PSNR by distance."""

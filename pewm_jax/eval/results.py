@@ -273,20 +273,22 @@ def gather_samples(scored: Scored, long: LongRollouts, **facts: Any) -> Samples:
     """
     arrays = {}
     for method, sums_SCT39 in scored.sums.items():
-        arrays |= _named("clips", method, sums_SCT39.sum(2)) | _named("frames", method, sums_SCT39)
+        arrays |= _score_arrays("clips", method, sums_SCT39.sum(2)) | _score_arrays(
+            "frames", method, sums_SCT39
+        )
     for method, sums_SCT39 in long.scored.sums.items():
-        arrays |= _named("rollouts", method, sums_SCT39)
+        arrays |= _score_arrays("rollouts", method, sums_SCT39)
     about = {
         "version": SAMPLES_VERSION,
         **facts,
         "clustered_by": scored.clustered_by,
-        "clips": _listed(scored.choices),
-        "rollouts": _listed(long.scored.choices),
+        "clips": _choice_rows(scored.choices),
+        "rollouts": _choice_rows(long.scored.choices),
     }
     return Samples(about, arrays)
 
 
-def _named(part: str, method: str, sums: np.ndarray) -> dict[str, np.ndarray]:
+def _score_arrays(part: str, method: str, sums: np.ndarray) -> dict[str, np.ndarray]:
     return {
         f"{part}/{method}/{mask}/{metric}": values
         for mask, by_metric in scores(sums).items()
@@ -294,7 +296,7 @@ def _named(part: str, method: str, sums: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-def _listed(choices: Sequence[ClipChoice]) -> list[list[Any]]:
+def _choice_rows(choices: Sequence[ClipChoice]) -> list[list[Any]]:
     return [[choice.name, choice.scene, choice.start] for choice in choices]
 
 

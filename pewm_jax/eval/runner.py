@@ -79,7 +79,7 @@ class ModelRunner:
         self.cameras = cameras
         self.config, self.batch, self.context = config, batch, context
         self.mesh = mesh_of(devices, batch)
-        self.params = self._everywhere(params)
+        self.params = self._replicate(params)
         self._log = log
         self._begin: Callable[..., WorldState] | None = None
         self._clip: dict[bool, Callable[..., tuple[WorldState, Frames]]] = {}
@@ -112,7 +112,7 @@ class ModelRunner:
                     ),
                     3,
                 ),
-                (self.params, *self._placed((states, control, keys))),
+                (self.params, *self._with_shardings((states, control, keys))),
                 self._log,
             )
 
@@ -147,7 +147,7 @@ class ModelRunner:
         """
         self.prepare([memory])
         assert self._begin is not None
-        params = self.params if params is None else self._everywhere(params)
+        params = self.params if params is None else self._replicate(params)
         first = state = self._begin(params, self._put(context))
         if watch is not None:
             watch(state)
@@ -171,7 +171,7 @@ class ModelRunner:
             begin = self._begin = _compile(
                 f"the start from {self.context} frames",
                 self._split(self._start_batch, 1),
-                (self.params, self._placed(self._abstract_context())),
+                (self.params, self._with_shardings(self._abstract_context())),
                 self._log,
             )
         return begin
@@ -185,7 +185,7 @@ class ModelRunner:
             function, mesh=self.mesh, in_specs=parts, out_specs=P("clips"), check_vma=False
         )
 
-    def _placed(self, tree: Any) -> Any:
+    def _with_shardings(self, tree: Any) -> Any:
         """Return abstract batches with their shardings."""
         if self.mesh is None:
             return tree
@@ -198,7 +198,7 @@ class ModelRunner:
         """Put batches on the devices."""
         return jax.device_put(tree, NamedSharding(self.mesh, P("clips"))) if self.mesh else tree
 
-    def _everywhere(self, params: Params) -> Params:
+    def _replicate(self, params: Params) -> Params:
         """Replicate weights on every device."""
         if self.mesh is None:
             return jax.tree.map(jnp.asarray, params)

@@ -167,7 +167,7 @@ def run(
         for at in range(0, len(ready), batch):
             some = ready[at : at + batch]
             filled = some + some[:1] * (batch - len(some))
-            plain, edited = (_stacked([x[k] for x in filled]) for k in (0, 1))
+            plain, edited = (_stack([x[k] for x in filled]) for k in (0, 1))
             actions = np.stack([trial.actions_T3 for trial in filled])
             for first in range(0, steps, chunk):
                 keys = jax.random.split(jax.random.key(at * 1000 + first), batch)
@@ -255,7 +255,7 @@ def _rays_on_block(
     return (ids != other) | (jnp.abs(depth - beyond) > 1e-3), within
 
 
-def _stacked(trees: Sequence[Any]) -> Any:
+def _stack(trees: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *x: jnp.stack([jnp.asarray(part) for part in x]), *trees)
 
 

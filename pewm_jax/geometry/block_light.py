@@ -44,7 +44,7 @@ def light(
     facing = jnp.where((side_HW == 2) & (way_HW3[..., 2] > 0), BELOW, facing)
     metres = far_HW * jnp.linalg.norm(way_HW3, axis=-1)
     at = (eye_3 - low_3 + far_HW[..., None] * way_HW3) / cell_m
-    dark = _dark(occupied_XYZ, cell_m, at, way_HW3, side_HW)
+    dark = _corner_darkness(occupied_XYZ, cell_m, at, way_HW3, side_HW)
     return facing / (1 + jnp.square(metres / HALF_M)) * (1 - CORNER * dark)
 
 
@@ -57,7 +57,7 @@ def side_of(at_HW3: Array) -> Array:
     return jnp.abs(at_HW3 - jnp.round(at_HW3)).argmin(-1)
 
 
-def _dark(
+def _corner_darkness(
     occupied_XYZ: Array, cell_m: float | Array, at_HW3: Array, way_HW3: Array, side_HW: Array
 ) -> Array:
     """Return (H, W) how close points are to a corner: 1 in it, 0 from ``CORNER_M`` on."""

@@ -59,8 +59,8 @@ def read(path: Path) -> Tensors:
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
-                return _finished(_read_zip(archive))
-        return _finished(_Reader(io.BytesIO(path.read_bytes()), {}).load())
+                return _require_arrays(_read_zip(archive))
+        return _require_arrays(_Reader(io.BytesIO(path.read_bytes()), {}).load())
     except Exception as error:  # a damaged pickle may raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(
@@ -171,14 +171,14 @@ def _parameter(tensor: Any, *_: Any) -> Any:
     return tensor
 
 
-def _finished(found: Any) -> Tensors:
+def _require_arrays(found: Any) -> Tensors:
     """Return the unpickled tables of arrays; raise an error for anything else."""
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
         raise pickle.UnpicklingError("it contains no table of named tensors")
     made: Tensors = {}
     for name, part in found.items():
         array = part.array if isinstance(part, _Array) else part
-        made[name] = array.copy() if isinstance(array, np.ndarray) else _finished(part)
+        made[name] = array.copy() if isinstance(array, np.ndarray) else _require_arrays(part)
     return made
 
 

@@ -198,7 +198,7 @@ def require_kinds(given: Mapping[str, Any], what: str, examples: Mapping[str, An
         UserError: a setting has another type.
     """
     for key, example in examples.items():
-        if not _alike(given[key], example):
+        if not _same_type(given[key], example):
             raise UserError(f"{what}'s {key} is {given[key]!r}; give a value like {example!r}.")
 
 
@@ -206,11 +206,11 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _alike(value: Any, example: Any) -> bool:
+def _same_type(value: Any, example: Any) -> bool:
     if isinstance(example, tuple | list):
         fits = isinstance(value, tuple | list)
         fits = fits and (isinstance(example, list) or len(value) == len(example))
-        return fits and all(_alike(item, example[0]) for item in value)
+        return fits and all(_same_type(item, example[0]) for item in value)
     if isinstance(example, float):
         return isinstance(value, int | float) and not isinstance(value, bool)
     return type(value) is type(example)

@@ -168,13 +168,13 @@ def places(path: Path) -> dict[str, Place]:
     Raises:
         UserError: the file is missing, truncated or damaged, or has an unsupported dtype.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         return _places(path, file)
 
 
 def metadata(path: Path) -> dict[str, str]:
     """Return the ``__metadata__`` of a safetensors file; raises as ``places``."""
-    with _opened(path) as file:
+    with _open(path) as file:
         _places(path, file)
         return file.metadata() or {}
 
@@ -194,7 +194,7 @@ def read(
     Raises:
         UserError: the file is missing or damaged, or a checksum is wrong.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         for name, place in _places(path, file).items():
             if wanted(name):
                 yield name, _read(path, file, place)
@@ -220,12 +220,12 @@ def read_at(path: Path, place: Place) -> np.ndarray:
     Raises:
         UserError: the file is missing or damaged, or a checksum is wrong.
     """
-    with _opened(path) as file:
+    with _open(path) as file:
         return _read(path, file, place)
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def _open(path: Path) -> Iterator[Any]:
     """Open a file with the library; raise its errors as ``UserError``."""
     if not path.is_file():
         raise UserError(f"{path} does not exist; train.py writes it at the end of a stage.")

@@ -157,10 +157,10 @@ def _lpips(net: Net, params: Params, rgb_PHWC: Array, goal_1HWC: Array) -> Array
     def one(picture: Array) -> Array:
         return lpips.distance(params, lpips.describe(net, params, picture[None]), goal)[0]
 
-    return jax.lax.map(one, rgb_PHWC, batch_size=_at_once(rgb_PHWC))
+    return jax.lax.map(one, rgb_PHWC, batch_size=_batch_size(rgb_PHWC))
 
 
-def _at_once(rgb_PHWC: Array) -> int:
+def _batch_size(rgb_PHWC: Array) -> int:
     return max(1, AT_ONCE // (rgb_PHWC.shape[1] * rgb_PHWC.shape[2]))
 
 
@@ -195,7 +195,7 @@ def _features(
         return settings.memory.encoder.features(settings, params, picture_HWC[None])[0]
 
     wanted = encoded(goal_1HWC[0])
-    each = jax.lax.map(encoded, rgb_PHWC, batch_size=_at_once(rgb_PHWC))
+    each = jax.lax.map(encoded, rgb_PHWC, batch_size=_batch_size(rgb_PHWC))
     return jnp.square(each - wanted).mean((1, 2, 3))
 
 

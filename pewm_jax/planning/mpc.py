@@ -207,15 +207,17 @@ def mpc(
                     meter.advance(1)
                 if reached:
                     break
-            present = _joined(seen)
+            present = _concatenate(seen)
             state = predictor.observe(state, present)
             frames.append(present)
             rest = shifted(config, found.choices)
     costs = np.array([float(found.cost) for found in plans])
-    return Trajectory(np.stack(actions), _joined(frames), tuple(plans), costs, bool(reached), state)
+    return Trajectory(
+        np.stack(actions), _concatenate(frames), tuple(plans), costs, bool(reached), state
+    )
 
 
-def _joined(frames: list[Frames]) -> Frames:
+def _concatenate(frames: list[Frames]) -> Frames:
     return jax.tree.map(lambda *x: np.concatenate(x), *frames)
 
 

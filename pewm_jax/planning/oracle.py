@@ -74,7 +74,7 @@ def _search(house: HouseEnv) -> list[int]:
         near = near and ways.length(planar[:2]) <= config.success_m
         turned = math.degrees(scores.yaw_error(planar, house.task.goal_3))
         if near and turned <= config.success_deg:
-            return _traced(came, number)
+            return _actions_to(came, number)
         for action in (FORWARD, TURN_LEFT, TURN_RIGHT):
             after, collided = move(house.grid, planar, table[action], sliding=False)
             if collided or _key(after, config.turn_deg) in closed:
@@ -104,7 +104,7 @@ def _key(planar: np.ndarray, turn_deg: float) -> tuple[int, int, int]:
     return round(planar[0] / SAME_M), round(planar[1] / SAME_M), heading
 
 
-def _traced(came: dict[int, tuple[int, int]], number: int) -> list[int]:
+def _actions_to(came: dict[int, tuple[int, int]], number: int) -> list[int]:
     """Return the actions that lead to a node of the search."""
     done = []
     while number:

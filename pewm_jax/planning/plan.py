@@ -115,10 +115,10 @@ def search(
 
     begun = planners.init(planner, config, start)
     found, rounds = jax.lax.scan(step, begun, jnp.arange(config.rounds))
-    return _finished(config, found, rounds)
+    return _to_plan(config, found, rounds)
 
 
-def _finished(config: PlanConfig, found: Search, rounds: Rounds) -> Plan:
+def _to_plan(config: PlanConfig, found: Search, rounds: Rounds) -> Plan:
     actions = planners.actions_of(config, found.best[None])[0]
     return Plan(actions, found.best, found.cost, rounds)
 
@@ -173,7 +173,7 @@ def plan(
     file = None
     if checkpoint is not None:
         file = ProgressFile(checkpoint, _identity(planner, config, key, begun, about), "a search")
-        begun, made = _resumed(file.read(), begun)
+        begun, made = _restore(file.read(), begun)
     meter = Meter("plan", config.rounds * config.candidates, "candidates") if progress else None
     found = begun
     with meter or contextlib.nullcontext():
@@ -193,7 +193,7 @@ def plan(
             f"no candidate of {config.rounds} rounds has a finite cost, so no plan can be chosen: "
             "check the cost, or allow other actions."
         )
-    return _finished(config, found, jax.tree.map(lambda *x: jnp.stack(x), *made))
+    return _to_plan(config, found, jax.tree.map(lambda *x: jnp.stack(x), *made))
 
 
 def _identity(planner: Planner, config: PlanConfig, key: Array, begun: Search, about: str) -> str:
@@ -211,7 +211,7 @@ def _arrays_of(search: Search, rounds: list[Rounds]) -> dict[str, np.ndarray]:
     return arrays | {f"rounds_{i}": np.stack(column) for i, column in enumerate(columns)}
 
 
-def _resumed(arrays: dict[str, np.ndarray] | None, begun: Search) -> tuple[Search, list[Rounds]]:
+def _restore(arrays: dict[str, np.ndarray] | None, begun: Search) -> tuple[Search, list[Rounds]]:
     """Return the state and the rounds from ``_arrays_of``; for None, those of a new search."""
     if arrays is None:
         return begun, []

@@ -84,7 +84,7 @@ def init(planner: Planner, config: PlanConfig, start: Array | None = None) -> Se
             jnp.broadcast_to(std, (blocks, len(low))),
         )
     if start is not None:
-        belief = _around(planner, belief, jnp.asarray(start), blocks)
+        belief = _belief_around(planner, belief, jnp.asarray(start), blocks)
     best, count = mode(belief), kept(planner, config)
     kept_EH = jnp.zeros((count, *best.shape), best.dtype)
     inf = jnp.asarray(jnp.inf, jnp.float32)
@@ -100,7 +100,7 @@ START_PROBABILITY = 0.5
 """Initial probability of the discrete choices that a search starts from."""
 
 
-def _around(planner: Planner, belief: Any, start: Array, blocks: int) -> Any:
+def _belief_around(planner: Planner, belief: Any, start: Array, blocks: int) -> Any:
     """Return a belief around the start choices."""
     space = planner.space
     wide = () if isinstance(space, Discrete) else (len(space.low),)
@@ -130,14 +130,14 @@ def propose(planner: Planner, config: PlanConfig, search: Search, key: Array) ->
     """
     belief = search.belief
     shape = (config.candidates, config.horizon)
-    drawn = _drawn(planner, belief, shape, key)
+    drawn = _draw(planner, belief, shape, key)
     first = mode(belief)
     if isinstance(planner, RandomShooting):  # its distribution never changes
         first = jnp.where(jnp.isfinite(search.cost), drawn[0], first)
     return drawn.at[0].set(first)
 
 
-def _drawn(planner: Planner, belief: Any, shape: tuple[int, int], key: Array) -> Array:
+def _draw(planner: Planner, belief: Any, shape: tuple[int, int], key: Array) -> Array:
     """Draw choices from a belief, or uniformly for random shooting."""
     space, uniform = planner.space, isinstance(planner, RandomShooting)
     if isinstance(space, Discrete):
@@ -175,7 +175,7 @@ def update(
     costs = jnp.concatenate([costs, search.kept_costs_E])
     costs = jnp.where(repeated(choices), jnp.inf, costs)
     weights = importance(planner, config, costs)
-    belief = _fitted(planner, search.belief, choices, weights)
+    belief = _fit(planner, search.belief, choices, weights)
     some = jnp.isfinite(costs).any()  # otherwise nothing was learned
     belief = jax.tree.map(lambda new, old: jnp.where(some, new, old), belief, search.belief)
     stays = jnp.argsort(costs, stable=True)[: kept(planner, config)]
@@ -188,7 +188,7 @@ def repeated(choices: Array) -> Array:
     return jnp.tril((flat[:, None] == flat[None]).all(-1), -1).any(1)
 
 
-def _fitted(planner: CEM | MPPI, belief: Any, choices_KH: Array, weights_K: Array) -> Any:
+def _fit(planner: CEM | MPPI, belief: Any, choices_KH: Array, weights_K: Array) -> Any:
     """Return the belief fitted to weighted choices, with momentum."""
     stays, learned = planner.momentum, 1 - planner.momentum
     if isinstance(planner.space, Discrete):

@@ -137,26 +137,26 @@ class Driver:
                     break
                 found = self._waiting.popleft() if self._waiting else None
             if found is not None:
-                self._guarded(lambda taken=found: self._take(*taken))
+                self._run_safely(lambda taken=found: self._take(*taken))
             elif self._todo:
-                self._guarded(lambda: self._drive(self._todo.popleft(), time.monotonic()))
+                self._run_safely(lambda: self._drive(self._todo.popleft(), time.monotonic()))
             elif not self._look_ahead():
-                self._rest()
-        self._guarded(self._end_film)
+                self._wait_for_request()
+        self._run_safely(self._end_film)
 
-    def _rest(self) -> None:
+    def _wait_for_request(self) -> None:
         """Sleep until a request arrives."""
         with self._changed:
             if not self._waiting and not self._ended:
                 self._idle.set()
                 self._changed.wait()
 
-    def _asked_within(self, seconds: float) -> bool:
+    def _request_within(self, seconds: float) -> bool:
         """Wait up to some seconds for a request; return whether one has arrived."""
         with self._changed:
             return self._changed.wait_for(lambda: bool(self._waiting) or self._ended, seconds)
 
-    def _guarded(self, work: Callable[[], None]) -> None:
+    def _run_safely(self, work: Callable[[], None]) -> None:
         """Call a function; show its error as a message."""
         try:
             work()
@@ -183,7 +183,7 @@ class Driver:
             self._todo.clear()
             self._drive(request, asked)
         elif isinstance(request, (Save, Load, Undo)):
-            self._keep(engine, now, request)
+            self._save_load_or_undo(engine, now, request)
         elif isinstance(request, GoTo):
             steps, target = engine.model.actions, np.asarray(request.planar, np.float64)
             parts = places.way(now.planar_3, target, steps.step_m, steps.turn_deg)
@@ -201,7 +201,7 @@ class Driver:
         else:
             self._edit(engine, now, request, asked)
 
-    def _keep(self, engine: Engine, now: Session, request: Save | Load | Undo) -> None:
+    def _save_load_or_undo(self, engine: Engine, now: Session, request: Save | Load | Undo) -> None:
         """Save a world, load one, or undo an edit."""
         if isinstance(request, Save):
             path = saved.save(engine, now.world, self._folder, request.name)
@@ -219,7 +219,7 @@ class Driver:
 
     def _sample_in(self, engine: Engine, now: Session) -> None:
         steps = engine.sampler_steps
-        with self._during(f"preparing {steps} steps of the sampler"):
+        with self._busy(f"preparing {steps} steps of the sampler"):
             self._warm(engine, now)
         self._made, self._engine = {}, engine
         self._log(f"Now imagining in {steps} steps of the sampler.")
@@ -230,7 +230,7 @@ class Driver:
             self._made = {}  # the steps imagined ahead may be invalid now
             self._log(self._session.said)
             return
-        with self._during("changing the map"):
+        with self._busy("changing the map"):
             after = session.apply(engine, now, request)
         self._before.append(now)
         self._set(after, asked)
@@ -238,10 +238,10 @@ class Driver:
 
     def _begin(self, start: Start) -> None:
         if self._engine is None:
-            with self._during("loading the model"):
+            with self._busy("loading the model"):
                 self._engine = self._load()
         engine = self._engine
-        with self._during("looking around"):
+        with self._busy("looking around"):
             place = places.open_place(start, *engine.size)
             places.require_shown(engine.model, start)
             begun = session.begin(engine, place, start.seed)
@@ -249,7 +249,7 @@ class Driver:
         self._before.clear()
         self._todo.clear()
         self._set(begun)
-        with self._during("preparing to imagine (half a minute the first time)"):
+        with self._busy("preparing to imagine (half a minute the first time)"):
             self._warm(engine, begun)
         self._log(f"{begun.said} Press W, A, S, D or the arrows.")
 
@@ -306,9 +306,9 @@ class Driver:
         for step in ([self._last] if self._last else []) + likely:
             action, _, _ = session.wanted(now, Drive(step))
             if action.tobytes() not in self._made and np.abs(action).max() > 0:
-                if self._asked_within(PAUSE_S):
+                if self._request_within(PAUSE_S):
                     return True
-                self._guarded(lambda a=action: self._make(engine, now, a))
+                self._run_safely(lambda a=action: self._make(engine, now, a))
                 return action.tobytes() in self._made
         return False
 
@@ -334,7 +334,7 @@ class Driver:
         path = film.close()
         self._log(f"The video is {path.name}.", link=path)
 
-    def _during(self, text: str) -> contextlib.AbstractContextManager[None]:
+    def _busy(self, text: str) -> contextlib.AbstractContextManager[None]:
         """Show the present work, and its duration."""
         return ticking(text, lambda said: self._log(said, busy=True))
 

@@ -69,7 +69,7 @@ def open_place(start: Start, height: int, width: int) -> StartPoint:
         hfov=start.hfov,
         camera_height=start.camera_height,
     )
-    planar = _beginning(simulator.grid, np.random.default_rng(start.seed))
+    planar = _start_pose(simulator.grid, np.random.default_rng(start.seed))
     around = np.tile(planar, (LOOKS, 1))
     around[:-1, 2] += 2 * np.pi * np.arange(1, LOOKS) / LOOKS
     name = Path(start.scene).name if start.scene else f"house {start.house}"
@@ -129,14 +129,14 @@ def walk(
     x, y, yaw = np.asarray(planar_3, np.float64)
     dx, dy, dyaw = np.asarray(action_3, np.float64)
     ahead = np.array([np.cos(yaw) * dx - np.sin(yaw) * dy, np.sin(yaw) * dx + np.cos(yaw) * dy])
-    return np.array([x + ahead[0], y + ahead[1], _wrapped(yaw + dyaw)]), False
+    return np.array([x + ahead[0], y + ahead[1], _wrap_angle(yaw + dyaw)]), False
 
 
 def action_between(before_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
     """Return the (3,) float32 action dx, dy, dyaw from one planar pose to another."""
     (dx, dy), yaw = after_3[:2] - before_3[:2], before_3[2]
     c, s = np.cos(yaw), np.sin(yaw)
-    turn = _wrapped(after_3[2] - yaw)
+    turn = _wrap_angle(after_3[2] - yaw)
     return np.array([c * dx + s * dy, c * dy - s * dx, turn], np.float32)
 
 
@@ -150,7 +150,7 @@ def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: floa
         turn_deg: largest turn, degrees.
     """
     far = float(np.linalg.norm(after_3[:2] - before_3[:2]))
-    turn = _wrapped(float(after_3[2] - before_3[2]))
+    turn = _wrap_angle(float(after_3[2] - before_3[2]))
     parts = int(max(np.ceil(far / step_m - 1e-6), np.ceil(abs(turn) / np.radians(turn_deg) - 1e-6)))
     share = np.linspace(0, 1, parts + 1)[:, None]
     poses = before_3 + share * (np.array([*after_3[:2], before_3[2] + turn]) - before_3)
@@ -212,7 +212,7 @@ def _recording(start: Start, height: int, width: int) -> StartPoint:
     return dataclasses.replace(place, name=folder.resolve().name)
 
 
-def _beginning(grid: NavGrid, rng: np.random.Generator) -> np.ndarray:
+def _start_pose(grid: NavGrid, rng: np.random.Generator) -> np.ndarray:
     """Return the pose x, y, yaw with the most free space among candidates, facing that space."""
     free = grid.centre_of(np.argwhere(grid.free_YX))
     places = sample_free(grid, rng, CANDIDATES)
@@ -222,6 +222,6 @@ def _beginning(grid: NavGrid, rng: np.random.Generator) -> np.ndarray:
     return np.array([*places[best], round(np.arctan2(y, x) / TURN) * TURN])
 
 
-def _wrapped(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     """Return an angle in (−π, π]."""
     return float(np.pi - (np.pi - angle) % (2 * np.pi))

@@ -109,13 +109,13 @@ def begin(engine: Engine, place: StartPoint, seed: int = 0) -> Session:
     """Start a drive with the observed frames of a start point."""
     world = engine.start(place.frames)
     said = f"This is {place.name} as observed; every step from here is imagined."
-    return dataclasses.replace(_begun(place, world, seed, said), observed=True)
+    return dataclasses.replace(_initial_session(place, world, seed, said), observed=True)
 
 
 def resume(session: Session, world: WorldState, said: str) -> Session:
     """Return a drive through another world, such as a saved one, with the same start point."""
     return dataclasses.replace(
-        _begun(session.place, world, session.seed, said), walls=session.walls
+        _initial_session(session.place, world, session.seed, said), walls=session.walls
     )
 
 
@@ -153,8 +153,8 @@ def apply(
         said = "Walls stop the agent." if event.stop else "The agent passes through walls."
         return dataclasses.replace(session, walls=event.stop, said=said)
     if isinstance(event, Drive):
-        return _driven(engine, session, event, made)
-    return _edited(engine, session, event)
+        return _apply_drive(engine, session, event, made)
+    return _apply_edit(engine, session, event)
 
 
 def catch_up(engine: Engine, session: Session) -> Session:
@@ -173,15 +173,17 @@ def pose(session: Session) -> np.ndarray:
     return np.asarray(session.world.frame.camera.world_from_camera[0])
 
 
-def _driven(engine: Engine, session: Session, event: Drive, made: WorldState | None) -> Session:
+def _apply_drive(
+    engine: Engine, session: Session, event: Drive, made: WorldState | None
+) -> Session:
     action, planar, collided = wanted(session, event)
     if collided and not np.abs(action).max() > 1e-6:
         return dataclasses.replace(session, said="Blocked by a wall.")
     world = ahead(engine, session, action) if made is None else made
-    return _after(engine, session, world, action, planar, "")
+    return _next_session(engine, session, world, action, planar, "")
 
 
-def _edited(engine: Engine, session: Session, event: Erase | Move) -> Session:
+def _apply_edit(engine: Engine, session: Session, event: Erase | Move) -> Session:
     """Edit the map, then imagine the present frame again, which fills holes."""
     if not engine.editable:
         raise UserError(
@@ -200,7 +202,7 @@ def _edited(engine: Engine, session: Session, event: Erase | Move) -> Session:
         said = f"{done} the box; the map has {len(engine.points(world)[0])} points."
     changed = dataclasses.replace(session, world=world)
     seen = ahead(engine, changed, STILL)
-    return _after(engine, changed, seen, STILL, session.planar_3, said)
+    return _next_session(engine, changed, seen, STILL, session.planar_3, said)
 
 
 def about_middle(
@@ -215,7 +217,7 @@ def about_middle(
     return transform.astype(np.float32)
 
 
-def _after(
+def _next_session(
     engine: Engine,
     session: Session,
     world: WorldState,
@@ -236,7 +238,7 @@ def _after(
     )
 
 
-def _begun(place: StartPoint, world: WorldState, seed: int, said: str) -> Session:
+def _initial_session(place: StartPoint, world: WorldState, seed: int, said: str) -> Session:
     camera = np.asarray(world.frame.camera.world_from_camera)[0]
     planar = np.array([camera[0, 3], camera[1, 3], float(heading(camera))], np.float64)
     if place.planar_3 is not None and np.allclose(planar[:2], place.planar_3[:2], atol=1e-4):

@@ -139,11 +139,11 @@ class Reprojection:
     def __call__(self, actions_KN: Any) -> Frames:
         """Return the frame after each candidate's last action, (K, 1) frames."""
         moves = continuous(self.motion, np.asarray(actions_KN))
-        return jax.device_get(_reprojected(self.settings, self.observed, moves))
+        return jax.device_get(_reproject(self.settings, self.observed, moves))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _reprojected(settings: ReprojectSettings, observed: Frames, moves_KN3: Any) -> Frames:
+def _reproject(settings: ReprojectSettings, observed: Frames, moves_KN3: Any) -> Frames:
     present = jax.tree.map(lambda x: jnp.asarray(x)[-1], observed.camera)
 
     def one(moves_N3: Any) -> Frames:

@@ -117,14 +117,14 @@ def make(
     piece: dict[str, Any] = {"house": home.house, "walked": {}}
     act = act_of(begun)
     if how == CHANCE:
-        act = _by_chance(begun.config.model.policy.waypoints)
+        act = _random_walk_policy(begun.config.model.policy.waypoints)
     elif how != BEFORE:
         act = act_of(_learned(world, begun, home, study, how, seed, folder))
-        piece["walked"] = _walked(folder / "data" / "train", home)
-    return piece | {"tasks": _measured(home, act, study, seed)}
+        piece["walked"] = _walk_statistics(folder / "data" / "train", home)
+    return piece | {"tasks": _evaluate_policy(home, act, study, seed)}
 
 
-def _by_chance(count: int) -> Act:
+def _random_walk_policy(count: int) -> Act:
     """Return a policy of random walks; see ``goals.wander``."""
 
     def act(rgb_SHWC: np.ndarray, goal_HWC: np.ndarray | None, key: jax.Array) -> np.ndarray:
@@ -135,7 +135,7 @@ def _by_chance(count: int) -> Act:
     return act
 
 
-def _walked(folder: Path, home: Goal) -> dict[str, float]:
+def _walk_statistics(folder: Path, home: Goal) -> dict[str, float]:
     """Return the percentage of forward actions, and of these the percentage through walls."""
     forward, through, count = 0, 0, 0
     for episode in EpisodeSource(folder):
@@ -245,7 +245,9 @@ def _record(walk: PracticeWalk, table_A3: np.ndarray, name: str, house: str) -> 
     return write_episode(arrays, name, house, {"policy": "practice"})
 
 
-def _measured(home: Goal, act: Act, study: PracticeConfig, seed: int) -> list[dict[str, float]]:
+def _evaluate_policy(
+    home: Goal, act: Act, study: PracticeConfig, seed: int
+) -> list[dict[str, float]]:
     """Return the scores of a policy sent to goals near the observed places, in the real house.
 
     It is stopped as soon as it is within reach of the goal: it need not detect the goal.

@@ -92,7 +92,7 @@ def run(
     for number, seed in enumerate(seeds):
         for row in chosen:
             with _timing(out, f"seed{seed}/{row.name}"):
-                found = _one(study, scorer, row, seed, plan, log)
+                found = _row_scores(study, scorer, row, seed, plan, log)
             for name, arrays in found.items():
                 group = pieces.setdefault(name, [])
                 if len(group) == number:
@@ -131,7 +131,7 @@ def _rows(
     return tuple(row for row in every if not only or row.name in only)
 
 
-def _one(
+def _row_scores(
     study: Study, scorer: Scorer, row: Row, seed: int, plan: dict[str, Any], log: Callable
 ) -> dict[str, Arrays]:
     """Train and score a row, and also its backbone if that is a row of the table.

@@ -80,10 +80,12 @@ def summary(
         and KVD only over seeds), p values over houses and over seeds (``p``, ``p_seeds``), and the
         same adjusted for the rows of the table (``adjust``).
     """
-    values = {name: _stacked([by_clip(each) for each in group]) for name, group in pieces.items()}
+    values = {
+        name: _stack_seeds([by_clip(each) for each in group]) for name, group in pieces.items()
+    }
     rows: dict[str, Any] = {}
     for name, group in pieces.items():
-        by_frame = _stacked([per_frame(each) for each in group])
+        by_frame = _stack_seeds([per_frame(each) for each in group])
         rows[name] = {
             "seeds": len(group),
             "measures": {
@@ -118,14 +120,14 @@ def summary(
         if against in AGAINST or against.startswith((CONTROL, PAPER_FORM))
     }
     for against, name in ((a, b) for a, found in differences.items() for b in found):
-        differences[against][name] |= _apart_as_sets(rows[name], rows[against])
+        differences[against][name] |= _set_distance_differences(rows[name], rows[against])
     chain = [name for name in CHAIN if name in pieces]
     order = [
         {
             "worse": worse,
             "better": better,
             "differences": _differences(values[better], values[worse], houses_C)
-            | _apart_as_sets(rows[better], rows[worse]),
+            | _set_distance_differences(rows[better], rows[worse]),
         }
         for worse, better in itertools.pairwise(chain)
     ]
@@ -154,7 +156,7 @@ def adjust(family: Sequence[Mapping[str, dict[str, Any]]]) -> None:
                     each[f"{name}_holm"] = value
 
 
-def _stacked(each: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def _stack_seeds(each: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Stack the values of training seeds along a first axis."""
     return {key: np.stack([one[key] for one in each]) for key in each[0]}
 
@@ -183,7 +185,9 @@ def _set_distances(
     return entries
 
 
-def _apart_as_sets(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+def _set_distance_differences(
+    first: Mapping[str, Any], second: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return first − second of FVD and KVD, paired by training seed."""
     found = {}
     for measure in (f"{kind}{part}" for kind in SETS for part in ("", "_half")):

@@ -241,7 +241,7 @@ def planned(study: Study, rows: Sequence[Row], log: Log) -> dict[str, Any]:
     names = {name: _model(study, row) for name, row in everything.items()}
     seconds: Times = {}
     if study.steps is None:
-        seconds = _timed(study, {names[name]: row for name, row in everything.items()}, log)
+        seconds = _step_times(study, {names[name]: row for name, row in everything.items()}, log)
     plan = {}
     for name, row in everything.items():
         second = not name.startswith("backbone")
@@ -253,10 +253,10 @@ def planned(study: Study, rows: Sequence[Row], log: Log) -> dict[str, Any]:
     return plan
 
 
-def _timed(study: Study, models: dict[str, Row], log: Log) -> Times:
+def _step_times(study: Study, models: dict[str, Row], log: Log) -> Times:
     """Return the seconds of a step for each model, from ``plan.json`` or measured now."""
     path = study.out / PLAN
-    kept = _kept(path)
+    kept = _read_times(path)
     missing = {model: row for model, row in models.items() if model not in kept}
     if not missing:
         return kept
@@ -264,13 +264,13 @@ def _timed(study: Study, models: dict[str, Row], log: Log) -> Times:
     beside = dict(list(known.items())[-1:])  # preferably a row, not a backbone
     found = _measure(study, {**beside, **missing}, log)
     scale = next((kept[model] / found[model] for model in beside), 1.0)
-    kept = _kept(path) | kept | {model: scale * found[model] for model in missing}
+    kept = _read_times(path) | kept | {model: scale * found[model] for model in missing}
     study.out.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, json.dumps(kept, indent=1) + "\n")
     return kept
 
 
-def _kept(path: Path) -> Times:
+def _read_times(path: Path) -> Times:
     try:
         kept = json.loads(path.read_text("utf-8"))
         return {str(model): float(seconds) for model, seconds in kept.items()}
@@ -300,7 +300,7 @@ def clock() -> Callable[[], float]:
 def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:
     """Return the median seconds per step of each model, measured in turn."""
     log(f"timing a step of {len(models)} trainings …")
-    steps = {model: _compiled(study, row, log) for model, row in models.items()}
+    steps = {model: _compile_step(study, row, log) for model, row in models.items()}
     taken: dict[str, list[float]] = {model: [] for model in steps}
     now = clock()
     for number in range(ROUNDS + 1):
@@ -318,7 +318,7 @@ def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:
     return found
 
 
-def _compiled(study: Study, row: Row, log: Log) -> Callable[[], None]:
+def _compile_step(study: Study, row: Row, log: Log) -> Callable[[], None]:
     """Compile a row's training step; return a function that runs one step on random weights."""
     config = settings(study, row, 0, 1, start=UNREAD)
     stage, mesh = STAGES[1 if row.reads else 0], sharding.make_mesh(arranged=config.train.mesh)

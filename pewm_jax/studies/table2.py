@@ -125,7 +125,7 @@ def run(
                         continue
                     goal = goal or _goal(study, config, number, times)
                     decide = functools.partial(
-                        _decided, name, goal, predictors, policy, cost, study
+                        _decide_and_score, name, goal, predictors, policy, cost, study
                     )
                     piece = f"{_folder(name, study, times, none)}/{number:04d}"
                     found = cache.compute(piece, decide)
@@ -187,7 +187,7 @@ def _goal(study: Table2Config, config: Config, number: int, times: int = 1) -> G
     )
 
 
-def _decided(
+def _decide_and_score(
     name: str,
     goal: Goal,
     predictors: Predictors,

@@ -39,7 +39,7 @@ def rows_of(where: Sharding, batch: int) -> slice:
         where: the sharding of the batch.
         batch: the global batch size.
     """
-    held = _held(where, batch)
+    held = _rows_on_process(where, batch)
     return slice(int(held[0]), int(held[-1]) + 1)
 
 
@@ -51,7 +51,7 @@ def place(clip: Clip, where: Sharding, batch: int) -> Clip:
         where: the sharding of every array.
         batch: the global batch size.
     """
-    held = _held(where, batch)
+    held = _rows_on_process(where, batch)
     own = held - held[0]
     if len(own) <= own[-1]:  # JAX takes only the rows that the process owns
         clip = jax.tree.map(lambda rows: rows[own], clip)
@@ -59,7 +59,7 @@ def place(clip: Clip, where: Sharding, batch: int) -> Clip:
     return jax.make_array_from_process_local_data(where, clip, shapes)
 
 
-def _held(where: Sharding, batch: int) -> np.ndarray:
+def _rows_on_process(where: Sharding, batch: int) -> np.ndarray:
     """Return the indices of the rows on this process's devices, in ascending order."""
     parts = where.addressable_devices_indices_map((batch,)).values()
     return np.unique([row for index in parts if index for row in range(batch)[index[0]]])
@@ -203,7 +203,7 @@ def prepare_clips(
     if folder is not None:
         like = jax.eval_shape(make, params, next(read(0)))
         while len(kept) < count and (file := _file(folder, len(kept))).is_file():
-            kept.append(_mapped(file, like))
+            kept.append(_map_file(file, like))
     if len(kept) == count:
         return kept
     batches = read(len(kept))
@@ -214,10 +214,10 @@ def prepare_clips(
                 return None
             clip = jax.device_get(make(params, batch))
             if folder is not None:
-                leaves = _named(clip)
+                leaves = _clip_arrays(clip)
                 file = _file(folder, number)
                 tensor_files.write(file, leaves, leaves.items(), tensor_files.header({}))
-                clip = _mapped(file, like)
+                clip = _map_file(file, like)
             kept.append(clip)
             meter.advance(1)
     return kept
@@ -291,7 +291,7 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
     return Path(config.data.prepared_path) / name
 
 
-def _named(clip: Clip) -> dict[str, Any]:
+def _clip_arrays(clip: Clip) -> dict[str, Any]:
     """Return the arrays of a clip by their names in files, unchanged since earlier versions."""
     renamed = {"readout": "sight"}
     found = {}
@@ -305,9 +305,9 @@ def _file(folder: Path, number: int) -> Path:
     return folder / f"{number:05}.safetensors"
 
 
-def _mapped(file: Path, like: Clip) -> Clip:
+def _map_file(file: Path, like: Clip) -> Clip:
     """Memory-map a file of prepared clips; raise UserError if its shapes differ."""
-    found, names = tensor_files.mapped(file), _named(like)
+    found, names = tensor_files.mapped(file), _clip_arrays(like)
     for name, leaf in names.items():
         if name not in found or found[name].shape != leaf.shape or found[name].dtype != leaf.dtype:
             raise UserError(

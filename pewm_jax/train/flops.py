@@ -261,7 +261,7 @@ class _Walk:
         self, params: Mapping[str, Any], marks: list[_Mark], wanted: list[bool]
     ) -> tuple[Work, list[_Mark]]:
         consts, carries = _scan_sizes(params)
-        before, each = marks[:consts], [_sliced(mark) for mark in marks[consts + carries :]]
+        before, each = marks[:consts], [_mark_of_slice(mark) for mark in marks[consts + carries :]]
         carry = [_Mark(mark.trained) for mark in marks[consts : consts + carries]]
         work, out = self._loop(params["jaxpr"].jaxpr, before, carry, each, wanted)
         return work.times(params["length"]), [_Mark(mark.trained) for mark in out]
@@ -488,7 +488,7 @@ def _trips(eqn: Any) -> int | None:
     return max(0, -(-(end - start) // step)) if step > 0 else None
 
 
-def _sliced(mark: _Mark) -> _Mark:
+def _mark_of_slice(mark: _Mark) -> _Mark:
     """Return the mark of a slice along the first dimension."""
     return _Mark(mark.trained, mark.axes[1:] if mark.axes else None)
 

@@ -143,7 +143,7 @@ def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Pa
     params = _start_weights(config)
     if file.exists():  # a checkpoint is verified while it is read
         processes.run_on_process_0(lambda: weights.verify(file))
-    for later in _later(config, stage):
+    for later in _later_stages(config, stage):
         extra = (
             _stage_shapes(config, later).keys() - _stage_shapes(config, stage).keys()
         ) & params.keys()
@@ -156,7 +156,7 @@ def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Pa
     return params
 
 
-def _later(config: Config, stage: Stage) -> list[Stage]:
+def _later_stages(config: Config, stage: Stage) -> list[Stage]:
     return [one for one in all_stages(config) if one.number > stage.number]
 
 

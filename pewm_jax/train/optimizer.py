@@ -105,7 +105,7 @@ def muon(adam: optax.GradientTransformation) -> optax.GradientTransformation:
 
     def sized(updates: Any, params: Any = None) -> Any:
         del params
-        return jax.tree_util.tree_map_with_path(_sized, updates)
+        return jax.tree_util.tree_map_with_path(_scale_update, updates)
 
     hidden = optax.chain(scale_by_muon(weight_dimension_numbers=_axes), optax.stateless(sized))
     return optax.partition({"muon": hidden, "adam": adam}, names)
@@ -115,18 +115,20 @@ def _axes(updates: Any) -> Any:
     """Return which axes of each matrix are inputs and which outputs."""
 
     def of(path: Any, leaf: Array) -> MuonDimensionNumbers:
-        return MuonDimensionNumbers(tuple(range(_first(path), leaf.ndim - 1)), leaf.ndim - 1)
+        return MuonDimensionNumbers(
+            tuple(range(_first_matrix_axis(path), leaf.ndim - 1)), leaf.ndim - 1
+        )
 
     return jax.tree_util.tree_map_with_path(of, updates)
 
 
-def _sized(path: Any, update: Array) -> Array:
+def _scale_update(path: Any, update: Array) -> Array:
     """Scale an orthogonal update to the RMS of Adam's."""
-    inputs = math.prod(update.shape[_first(path) : -1])
+    inputs = math.prod(update.shape[_first_matrix_axis(path) : -1])
     return MUON_RMS * math.sqrt(max(inputs, update.shape[-1])) * update
 
 
-def _first(path: Any) -> int:
+def _first_matrix_axis(path: Any) -> int:
     """Return the first matrix axis of the leaf at this path: 1 if layers are stacked."""
     return int(any(getattr(key, "key", None) == STACKED for key in path))
 

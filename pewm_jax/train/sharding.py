@@ -67,7 +67,7 @@ def of_state(model: World, mesh: Mesh | AbstractMesh, state: Any) -> Any:
         TreeError: no rule matches some leaves.
     """
     return jax.tree.map(
-        lambda leaf, spec: NamedSharding(mesh, _fitted(mesh, leaf, spec)[0]),
+        lambda leaf, spec: NamedSharding(mesh, _fit_spec(mesh, leaf, spec)[0]),
         state,
         _specs(model, state),
     )
@@ -80,7 +80,7 @@ def constrain(model: World, params: Params) -> Params:
         return params
     specs = tree.assign(rules(model), {"params": params}, "sharding rules")["params"]
     return jax.tree.map(
-        lambda x, spec: jax.lax.with_sharding_constraint(x, _fitted(mesh, x, spec)[0]),
+        lambda x, spec: jax.lax.with_sharding_constraint(x, _fit_spec(mesh, x, spec)[0]),
         params,
         specs,
     )
@@ -95,7 +95,7 @@ def left_out(model: World, mesh: Mesh | AbstractMesh, state: Any) -> dict[str, t
         state: a (possibly abstract) state.
     """
     leaves, specs = tree.flatten(state), tree.flatten(_specs(model, state))
-    missed = {path: _fitted(mesh, leaf, specs[path])[1] for path, leaf in leaves.items()}
+    missed = {path: _fit_spec(mesh, leaf, specs[path])[1] for path, leaf in leaves.items()}
     return {path: axes for path, axes in missed.items() if axes}
 
 
@@ -103,7 +103,7 @@ def _specs(model: World, state: Any) -> Any:
     return tree.assign(rules(model), state, "sharding rules")
 
 
-def _fitted(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> tuple[P, tuple[str, ...]]:
+def _fit_spec(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> tuple[P, tuple[str, ...]]:
     """Align a spec to a leaf's last axes; also return the mesh axes that do not divide them."""
     shape = tuple(getattr(leaf, "shape", ()))
     kept: list[str | None] = [None] * len(shape)

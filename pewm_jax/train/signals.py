@@ -155,7 +155,7 @@ class Stop:
             left = None if self._deadline is None else max(self._deadline - time.monotonic(), 0.0)
             ready, _, _ = select.select([self._read], [], [], left)
             if not ready:
-                self._late()
+                self._end_process()
                 continue
             for number in os.read(self._read, 64):
                 if number == 0:
@@ -163,21 +163,21 @@ class Stop:
                 if number not in self.SIGNALS:
                     continue
                 if self._asked is None:
-                    self._ask(number)
+                    self._request_stop(number)
                 elif time.monotonic() - self._asked > ONE_S:
                     self._leave(
                         f"Exited immediately ({self.kept()}); run the same command again to resume."
                     )
 
-    def _ask(self, number: int) -> None:
+    def _request_stop(self, number: int) -> None:
         """Record the first signal and set the deadline."""
         self.number, self._asked = number, time.monotonic()
         if self.at_once:
             self._deadline = self._asked + LINGER_S
         else:
-            self._grant()
+            self._start_grace_period()
 
-    def _grant(self) -> None:
+    def _start_grace_period(self) -> None:
         """Set the deadline for saving, counted from the signal, and print it."""
         assert self._asked is not None
         self._deadline = self._asked + self._grace_s * (1 - MARGIN)
@@ -186,13 +186,13 @@ class Stop:
             "signal again to exit without saving."
         )
 
-    def _late(self) -> None:
+    def _end_process(self) -> None:
         """End the process, because the main thread has not done so in time."""
         assert self._asked is not None
         if self.at_once:
             self._leave(self._nothing_new())
         if time.monotonic() < self._asked + self._grace_s * (1 - MARGIN):
-            self._grant()  # the first step ended just when the signal came
+            self._start_grace_period()  # the first step ended just when the signal came
             return
         self._leave(
             f"Exited before saving was done, because the {self._grace_s:g} s of train.grace_s are "

@@ -176,7 +176,7 @@ def train_step(
     if config.train.on_nonfinite == "skip":
         good = jnp.isfinite(metrics["loss"]) & jnp.isfinite(metrics["grad_norm"])
         unmoved = dataclasses.replace(state, step=after.step)
-        after = jax.tree.map(functools.partial(_unless, good), after, unmoved)
+        after = jax.tree.map(functools.partial(_select, good), after, unmoved)
         metrics["skipped"] = ~good
     return after, jax.tree.map(jnp.asarray, metrics)
 
@@ -296,6 +296,6 @@ def _norm(gradients: Params) -> Array:
     return jnp.sqrt(sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(gradients)))
 
 
-def _unless(good: Array, new: Array, old: Array) -> Array:
+def _select(good: Array, new: Array, old: Array) -> Array:
     """Select the new leaf or the old one; leaves that were passed through are unchanged."""
     return new if new is old else jnp.where(good, new, old)

@@ -77,7 +77,7 @@ class LPIPS:
 
         def to(imagined_BTHWC: Array) -> Array:
             imagined, _ = colours(imagined_BTHWC, truth_BTHWC)
-            return _to_described(self.net, self.params, imagined, described)
+            return _distances_to_features(self.net, self.params, imagined, described)
 
         return to
 
@@ -85,7 +85,7 @@ class LPIPS:
         """Return ``lpips.describe`` of all images of clips."""
         truth, _ = colours(truth_BTHWC, truth_BTHWC)
         lpips.require_size(self.net, *truth.shape[2:4])
-        return _described(self.net, self.params, truth)
+        return _describe(self.net, self.params, truth)
 
     @property
     def about(self) -> str:
@@ -107,22 +107,22 @@ def _distances(net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Arr
     def one(pair: tuple[Array, Array]) -> Array:
         return lpips.apply(net, params, pair[0][None], pair[1][None])[0]
 
-    return jax.lax.map(one, pairs, batch_size=_at_once(pairs[0])).reshape(clips, frames)
+    return jax.lax.map(one, pairs, batch_size=_batch_size(pairs[0])).reshape(clips, frames)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _described(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...]:
+def _describe(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...]:
     """Return the features of colours in [0, 1]; the image axis comes first."""
     pictures = 2 * truth_BTHWC.reshape(-1, *truth_BTHWC.shape[2:]) - 1
 
     def one(picture: Array) -> tuple[Array, ...]:
         return tuple(x[0] for x in lpips.describe(net, params, picture[None]))
 
-    return jax.lax.map(one, pictures, batch_size=_at_once(pictures))
+    return jax.lax.map(one, pictures, batch_size=_batch_size(pictures))
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _to_described(
+def _distances_to_features(
     net: Net, params: Params, imagined_BTHWC: Array, truth: tuple[Array, ...]
 ) -> Array:
     """Compare colours in [0, 1] with precomputed features."""
@@ -133,11 +133,11 @@ def _to_described(
         mine = lpips.describe(net, params, pair[0][None])
         return lpips.distance(params, mine, [x[None] for x in pair[1]])[0]
 
-    found = jax.lax.map(one, (pictures, truth), batch_size=_at_once(pictures))
+    found = jax.lax.map(one, (pictures, truth), batch_size=_batch_size(pictures))
     return found.reshape(clips, frames)
 
 
-def _at_once(pictures_NHWC: Array) -> int:
+def _batch_size(pictures_NHWC: Array) -> int:
     return max(1, PIXELS // (pictures_NHWC.shape[1] * pictures_NHWC.shape[2]))
 
 

@@ -307,11 +307,11 @@ class VideoDistance:
 def _features(params: Params, video_BTHWC: Array) -> Array:
     """Return the logits of clips with colours in [0, 1], a bounded number of them at once."""
     at_once = max(1, FRAMES // video_BTHWC.shape[1])
-    one = functools.partial(_of_one, params)
+    one = functools.partial(_clip_features, params)
     return jax.lax.map(one, 2 * video_BTHWC - 1, batch_size=at_once)
 
 
-def _of_one(params: Params, video_THWC: Array) -> Array:
+def _clip_features(params: Params, video_THWC: Array) -> Array:
     return i3d.apply(params, video_THWC[None])[0]
 
 
