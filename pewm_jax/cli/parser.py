@@ -322,7 +322,7 @@ def choose(name: str, known: Sequence[str], what: str) -> str:
     if name in known:
         return name
     raise ConfigError(
-        f"There is no {what} {name!r}{_nearest(name, known)}; known: {', '.join(known)}."
+        f"There is no {what} {name!r}{_nearest(name, known)}; choose from {', '.join(known)}."
     )
 
 

@@ -148,7 +148,7 @@ def require_known(values: Mapping[str, Any], what: str, known: Collection[str]) 
     unknown = sorted(key for key in values if not key.startswith("_") and key not in known)
     if unknown:
         raise UserError(
-            f"{what} has settings that are unknown: {', '.join(unknown)}; known are "
+            f"{what} has settings that are not known: {', '.join(unknown)}; known are "
             f"{', '.join(sorted(known))}."
         )
 

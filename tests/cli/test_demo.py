@@ -61,7 +61,7 @@ def test_a_part_that_fails_ends_it(called, monkeypatch, capsys):
 
 def test_a_folder_that_training_refuses_is_refused_before_the_walks(called):
     Path("taken").write_text("a file")
-    with pytest.raises(UserError, match="taken cannot be made"):
+    with pytest.raises(UserError, match="taken cannot be created"):
         run("--run", "taken")
     assert called == []
 

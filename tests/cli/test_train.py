@@ -189,7 +189,10 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
             ["tiny", "--clip.height", "20"],
             "backbone.patch = 8; change the clip's size or the patch",
         ),
-        (["tiny", "stray"], "stray; `pewm-jax train tiny --help` lists the settings."),
+        (
+            ["tiny", "stray"],
+            "stray is an unexpected argument; `pewm-jax train tiny --help` lists the settings.",
+        ),
         (["tiny", "--config"], "--config needs the name of a JSON file"),
         (["tiny", "--config", "none.json"], "none.json cannot be read"),
     ],
@@ -282,7 +285,7 @@ def test_an_unknown_subcommand_is_one_sentence_with_the_nearest(capsys):
     assert command.main(["trian", "demo"]) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("error: There is no command 'trian' (did you mean train?); there is ")
+    assert err.startswith("error: There is no command 'trian' (did you mean train?); choose from ")
     assert err.count("\n") == 1
 
 

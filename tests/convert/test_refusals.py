@@ -280,7 +280,7 @@ def test_the_help_explains_every_command(capsys):
         with pytest.raises(SystemExit) as leave:
             program.main([*command.split(), "--help"])
         assert leave.value.code == 0
-        assert "Folder to make" in capsys.readouterr().out
+        assert "Folder to create" in capsys.readouterr().out
     assert "did you mean import?" in refused(capsys, "imprt")
     assert "did you mean cogvideox?" in refused(capsys, "import", "cogvideo")
 

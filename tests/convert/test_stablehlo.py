@@ -129,7 +129,7 @@ def test_a_denoise_step_is_checked_in_a_fresh_process(run, params, tmp_path):
     [
         ({"clips": 0}, "clips is 0: use at least 1"),
         ({"frames": 0}, "frames is 0: use at least 1"),
-        ({"platforms": ["rocket"]}, "no platform rocket; there is cpu, cuda, tpu"),
+        ({"platforms": ["rocket"]}, "no platform rocket; choose from cpu, cuda, tpu"),
         ({"platforms": []}, "no platform given"),
     ],
 )

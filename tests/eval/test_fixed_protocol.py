@@ -105,7 +105,7 @@ def test_the_content_of_an_episode_is_part_of_it(episodes, tmp_path):
     assert protocol(config, changed).sha256 != made.sha256
     with pytest.raises(UserError, match="has another one of that name"):
         protocols.find_clips(made, changed, "data/mine")
-    with pytest.raises(UserError, match=r"room-0/revisit .*does not hold it; name the folder"):
+    with pytest.raises(UserError, match=r"room-0/revisit .*does not have it; give the folder"):
         protocols.find_clips(made, changed[1:], "data/mine")
 
 
@@ -200,7 +200,7 @@ def test_it_stands_above_the_settings(episodes, tmp_path):
     with pytest.raises(UserError, match="8 imagined frames but this model imagines 12 at once"):
         protocols.apply_protocol_file(longer, {})
     taller = named.with_model(clip=dataclasses.replace(plain.model.clip, height=32))
-    with pytest.raises(UserError, match="16×16 and this model makes 32×16"):
+    with pytest.raises(UserError, match="16×16 but this model makes 32×16"):
         protocols.apply_protocol_file(taller, {})
 
 

@@ -88,7 +88,9 @@ def test_what_cannot_be_planned_is_refused_before_anything_is_compiled(monkeypat
     tiny = configs.load("tiny")
     with pytest.raises(ConfigError, match="--chip 'h900' is unknown"):
         plan.show(tiny, launch(chip="h900"))
-    with pytest.raises(ConfigError, match=r"train\.stage1\.batch is 2, which 8 devices cannot"):
+    with pytest.raises(
+        ConfigError, match=r"train\.stage1\.batch is 2, which cannot be split evenly over 8 devices"
+    ):
         plan.show(tiny, launch())
     train = dataclasses.replace(tiny.train, mesh=MeshConfig(fsdp=3))
     with pytest.raises(ConfigError, match="choose axes whose product is that number"):

@@ -256,7 +256,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(params):
     env = world(params)
     for act, says in (
         (lambda: env.step(0), "outside of an episode"),
-        (lambda: env.reset(options={"frames": seen()}), "got the options frames: give frames"),
+        (lambda: env.reset(options={"frames": seen()}), "got the options frames: pass frames"),
         (lambda: env.reset(options={"goals": 1, "frames": 2}), "got the options frames, goals"),
         (
             lambda: env.reset(

@@ -107,7 +107,7 @@ def test_the_whole_study_is_made_kept_and_goes_on(made):
     study.run(folder / "world", folder / "policy", folder / "out", ERRAND, log=lambda _: None)
     assert (pieces[0].read_bytes(), pieces[-1].read_bytes()) == undisturbed
     other = dataclasses.replace(ERRAND, steps=2)
-    with pytest.raises(UserError, match=r"holds pieces of other settings \(steps\)"):
+    with pytest.raises(UserError, match=r"contains pieces of other settings \(steps\)"):
         study.run(folder / "world", folder / "policy", folder / "out", other, log=lambda _: None)
 
 

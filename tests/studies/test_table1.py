@@ -501,7 +501,7 @@ def test_the_walk_back_passes_the_same_cameras():
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["--rows", "nothing"], "there are no rows nothing; choose of none, "),
+        (["--rows", "nothing"], "there are no rows nothing; choose from none, "),
         (["--values", "3"], "values apply to an ablation"),
         (["--ablate", "cell", "--values", "wide"], "the ablation cell cannot take 'wide'"),
         (["--ablate", "cell", "--values", "0"], "the ablation cell cannot take '0'"),

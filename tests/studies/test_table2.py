@@ -88,7 +88,7 @@ def test_what_is_decided_is_kept_and_more_can_be_added(made):
     new = set((folder / "out").glob("decisions/**/*.json")) - set(files)
     assert {file.parent.parent.name for file in new} == {"mine.other"}  # plans are found again
     wrong = dataclasses.replace(ERRAND, cost="lpips")
-    with pytest.raises(UserError, match="holds decisions of other settings"):
+    with pytest.raises(UserError, match="contains decisions of other settings"):
         table2.run(folder / "run", folder / "out", wrong, other, costs.Pixels(), lambda _: None)
     assert "mine:other" in page.read_text()
 

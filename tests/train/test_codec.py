@@ -366,5 +366,5 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     configuration.save(dataclasses.replace(config, train=half), run / "config.json")
     with pytest.raises(UserError, match="is not fully trained"):
         codec_score.score(run, data=data, split="validation")
-    with pytest.raises(ConfigError, match="leave out --seeds, --steps"):
+    with pytest.raises(ConfigError, match="omit --seeds, --steps"):
         program.execute(["evaluate", str(run), "--steps", "2", "--seeds", "0"])

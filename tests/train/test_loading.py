@@ -118,7 +118,7 @@ def test_where_no_checkpoint_is_whole_the_stage_before_is_loaded_or_a_sentence_g
     (run / "weights.safetensors").unlink()
     spoil(run / "checkpoints" / "stage1")
     with (
-        pytest.warns(UserWarning, match="the previous one"),
+        pytest.warns(UserWarning, match="[Tt]he previous one"),
         pytest.raises(UserError, match=r"manifest\.json is damaged"),
     ):
         pewm_jax.load(run)

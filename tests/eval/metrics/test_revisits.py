@@ -107,7 +107,7 @@ def test_what_cannot_work_is_refused_in_a_sentence(files, monkeypatch, tmp_path)
         metrics.load("src")
     with pytest.raises(UserError, match="holds no DINOv2"):
         metrics.load("src", tmp_path)
-    with pytest.raises(UserError, match="no encoder 'clip'; there is dinov2, alex, vgg"):
+    with pytest.raises(UserError, match="no encoder 'clip'; choose one of dinov2, alex, vgg"):
         revisits.read_encoder("clip")
     with pytest.raises(UserError, match=r"no metric 'mirror\[fvd\]'"):
         metrics.load("mirror[fvd]")
