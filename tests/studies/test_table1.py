@@ -512,8 +512,8 @@ def test_the_walk_back_passes_the_same_cameras():
         (["--seeds", "1", "1"], "give each training seed once"),
         (["--seeds", "0", "-1"], "give each training seed once, one at least, from 0 on"),
         (["--ablate", "cell", "--rows", "none"], "rows are of the table, and not of an ablation"),
-        (["--preset", "nomad"], "of a NomadWorldConfig, and Table 1 compares memories"),
-        (["--preset", "codec"], "of a CodecWorldConfig, and Table 1 compares memories"),
+        (["--preset", "nomad"], "of a NomadTask, and Table 1 compares memories"),
+        (["--preset", "codec"], "of a CodecTask, and Table 1 compares memories"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):

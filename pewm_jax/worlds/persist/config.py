@@ -1,17 +1,26 @@
-"""PERSIST: a world whose state is a grid of class ids, which a diffusion model carries on."""
+"""Settings of PERSIST, as the modules of this folder use them; ``world.py`` has its methods."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import Any, ClassVar
 
-from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
-from pewm_jax.config.training import StageConfig, TrainSettings
-from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities
+from pewm_jax.config import (
+    ArraySpec,
+    AssembledModel,
+    BatchSpec,
+    Capabilities,
+    ClipConfig,
+    Codec,
+    Conditioner,
+    Noise,
+    StageConfig,
+    TrainSettings,
+)
 from pewm_jax.errors import require
-from pewm_jax.registry import named, part
+from pewm_jax.memory.class_grid import GridConfig
+from pewm_jax.models.persist.nets import PersistNetsConfig
+from pewm_jax.registry import part
 
 POINT_WAVES = 4
 """Wavelengths of the sinusoids of a place, with ``model.points``."""
@@ -19,7 +28,7 @@ POINT_WAVES = 4
 
 @dataclasses.dataclass(frozen=True)
 class PersistTrainConfig(TrainSettings):
-    """How the world learns: its networks one after the other, the codec of pictures given."""
+    """How the world is trained: one network after the other; the codec of pictures is frozen."""
 
     run: str = "runs/persist"
     """Folder of this run: checkpoints, logs, images, report."""
@@ -33,11 +42,11 @@ class PersistTrainConfig(TrainSettings):
     voxel_statistics: StageConfig = StageConfig(steps=60, learning_rate=0.03, warmup=0)
     """Mean and scale of the voxels' latents are fitted."""
     world_frames: StageConfig = StageConfig()
-    """The transformer that makes the next voxel frame."""
+    """The transformer that predicts the next voxel frame."""
     camera: StageConfig = StageConfig()
-    """The transformer that says where the camera goes."""
+    """The transformer that predicts the camera."""
     renderer: StageConfig = StageConfig()
-    """The transformer that makes pictures of voxels."""
+    """The transformer that renders voxels."""
     blind: float = 0.3
     """Share of frames after the first that are shown no picture."""
 
@@ -83,16 +92,16 @@ PUBLISHED_CLIP = ClipConfig(frames=16, height=288, width=512, depth=False)
 
 
 @dataclasses.dataclass(frozen=True)
-class PersistConfig(ModelConfig):
-    """A world that is three-dimensional itself (PERSIST, arXiv 2603.03482)."""
+class PersistModel(AssembledModel):
+    """Base class of ``PERSIST``: a world that is three-dimensional itself (arXiv 2603.03482)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = PersistTrainConfig
 
     clip: ClipConfig = PUBLISHED_CLIP
-    """What one clip is."""
+    """Shape of a clip."""
     codec: Codec = part("codec", "learned")
     """Codec: pictures to latents and back."""
-    backbone: Backbone = part("backbone", "persist")
+    backbone: PersistNetsConfig = part("backbone", "persist")
     """The four networks."""
     control: Conditioner = part(
         "control",
@@ -104,7 +113,7 @@ class PersistConfig(ModelConfig):
         angles=(),
     )
     """The numbers of an action; nothing else of it is used."""
-    memory: Memory = part("memory", "grid")
+    memory: GridConfig = part("memory", "grid")
     """The state of the world."""
     noise: Noise = part("noise", "frame_flow", per_frame=True, context_noise=0.1)
     """Noise of pictures, sampler."""
@@ -129,7 +138,7 @@ class PersistConfig(ModelConfig):
     @property
     def batch_spec(self) -> BatchSpec:
         """Actions, and the recorded voxels around the agent."""
-        side = self.memory.recorded  # type: ignore[attr-defined]
+        side = self.memory.recorded
         voxels = (
             ("classes_TXYZ", ArraySpec((self.clip.frames, side, side, side), "uint16")),
             ("origin_T3", ArraySpec((self.clip.frames, 3))),
@@ -153,10 +162,7 @@ class PersistConfig(ModelConfig):
 
     def __post_init__(self):
         """Validate."""
-        for name, kind in (
-            ("backbone", named("backbone", "persist").settings),
-            ("memory", named("memory", "grid").settings),
-        ):
+        for name, kind in (("backbone", PersistNetsConfig), ("memory", GridConfig)):
             found = getattr(self, name)
             require(
                 isinstance(found, kind),
@@ -178,7 +184,7 @@ class PersistConfig(ModelConfig):
                 self.clip.depth or not getattr(self, name),
                 f"model.{name} needs depth: use clip.depth true, or leave {name} out.",
             )
-        pictures = self.memory.pictures  # type: ignore[attr-defined]
+        pictures = self.memory.pictures
         require(
             not self.observation_logit or pictures == "cells",
             f"model.observation_logit is {self.observation_logit} and memory.pictures {pictures}: "
