@@ -23,7 +23,7 @@ from pewm_jax.models.persist.nets import PersistNetsConfig
 from pewm_jax.registry import part
 
 POINT_WAVES = 4
-"""Wavelengths of the sinusoids of a place, with ``model.points``."""
+"""Wavelengths of the sinusoids of a position, with ``model.points``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,17 +48,17 @@ class PersistTrainConfig(TrainSettings):
     renderer: StageConfig = StageConfig()
     """The transformer that renders voxels."""
     blind: float = 0.3
-    """Share of frames after the first that are shown no picture."""
+    """Share of frames after the first that are not conditioned on a picture."""
 
     occupied: float = 1.0
-    """What the error of a world frame's latent counts where anything is in its cells, beside those
-    of air, which are most; 1 as published."""
+    """Weight of the error of a world frame's latent whose cells are not all air; 1 as published.
+    Most cells are air."""
     classes: float = 0.0
-    """What the classes of a world frame's cells count beside the error of its latents: their
-    cross-entropy through the frozen decoder; 0 as published. It needs a decoder that sees one
-    latent at a time (`voxel_vae.kernel` and `middle_kernel` 1, one number of `widths`)."""
+    """Weight of the cross-entropy of a world frame's classes, through the frozen decoder, relative
+    to the error of its latents; 0 as published. It needs a decoder that decodes one latent at a
+    time (`voxel_vae.kernel` and `middle_kernel` 1, one number of `widths`)."""
     compared: int = 256
-    """Latents of a frame whose cells are compared, drawn by what their error counts."""
+    """Latents of a frame whose classes are compared, drawn by the weights of their errors."""
 
     def __post_init__(self):
         """Validate."""
@@ -129,11 +129,11 @@ class PersistModel(AssembledModel):
     """Nats that a real picture of blocks (`memory.pictures cells`) adds to the class that it shows
     in a cell: air before the measured depth, a surface at it; 0 as published."""
     points: bool = False
-    """Whether the picture that a voxel frame is shown comes with the place of its surfaces, from
-    its depth; not as published."""
+    """Whether the picture that conditions a voxel frame has the positions of its surfaces, from
+    depth, as further channels; not as published."""
     dead_reckoning: bool = False
-    """Whether the camera model says by what a step differs from the planar action, and not the step
-    itself; not as published."""
+    """Whether the camera model predicts how a step differs from the planar action, instead of the
+    step; not as published."""
 
     @property
     def batch_spec(self) -> BatchSpec:
@@ -152,12 +152,12 @@ class PersistModel(AssembledModel):
 
     @property
     def picture_channels(self) -> int:
-        """Channels of a picture's latents: with those of depth, if that is imagined."""
+        """Channels of a picture's latents; those of depth are among them if depth is imagined."""
         return self.codec.channels if self.clip.depth else self.codec.rgb_channels
 
     @property
     def shown_channels(self) -> int:
-        """Channels of what a voxel frame is shown of a picture."""
+        """Channels of the picture that conditions a voxel frame."""
         return self.picture_channels + (6 * POINT_WAVES if self.points else 0)
 
     def __post_init__(self):
