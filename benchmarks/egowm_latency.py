@@ -20,19 +20,19 @@ import numpy as np
 from record import machine, record, table
 
 from pewm_jax import presets, worlds
-from pewm_jax.config import EgoWMConfig
 from pewm_jax.types import Camera, Frames
+from pewm_jax.worlds.egowm.world import EgoWM
 
 PRESET = "egowm_tiny"
 
 
-def models(preset: str, chunk: int, steps: int) -> dict[str, EgoWMConfig]:
+def models(preset: str, chunk: int, steps: int) -> dict[str, EgoWM]:
     """Return the two ways: the same networks, clips of 2 frames and of ``chunk`` + 1."""
     base = presets.load(preset).model
-    assert isinstance(base, EgoWMConfig)
+    assert isinstance(base, EgoWM)
     noise = dataclasses.replace(base.noise, sample_steps=steps)
 
-    def of(frames: int) -> EgoWMConfig:
+    def of(frames: int) -> EgoWM:
         return dataclasses.replace(
             base, clip=dataclasses.replace(base.clip, frames=frames), noise=noise
         )
@@ -81,7 +81,7 @@ def main() -> None:
         record("egowm_latency", "\n\n".join(["## Frame by frame against chunks", how, text]))
 
 
-def _frame(model: EgoWMConfig) -> Frames:
+def _frame(model: EgoWM) -> Frames:
     """Return one random frame."""
     rng, size = np.random.default_rng(0), model.clip
     shape = (1, size.height, size.width)

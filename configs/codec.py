@@ -1,14 +1,7 @@
 """The learned codec on procedural houses of 64×64 pixels: about an hour on two CPU cores."""
 
-from pewm_jax.config import (
-    ClipConfig,
-    CodecTrainConfig,
-    CodecWorldConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    StageConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig
+from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 
 
 def config() -> Config:
@@ -20,7 +13,7 @@ def config() -> Config:
     not looked at. ``pewm-jax evaluate runs/codec`` prints the numbers on houses never trained on.
     """
     return Config(
-        model=CodecWorldConfig(clip=ClipConfig(frames=2)),
+        model=CodecTask(clip=ClipConfig(frames=2)),
         data=DataConfig(path="data/codec", stride_max=8, context=1),
         train=CodecTrainConfig(
             codec=StageConfig(steps=3000, batch=16, learning_rate=2e-3, warmup=100),

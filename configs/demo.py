@@ -1,19 +1,12 @@
 """Procedural houses at 64×64 pixels: two stages and a report in ten minutes on two CPU cores."""
 
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    ModelConfig,
-    StageConfig,
-    TrainConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.render import RenderConfig
+from pewm_jax.worlds.pewm.world import PEWM
 
 
 def config() -> Config:
@@ -24,7 +17,7 @@ def config() -> Config:
     a CPU longer than a step does.
     """
     return Config(
-        model=ModelConfig(
+        model=PEWM(
             clip=ClipConfig(height=64, width=64),
             codec=LearnedCodecConfig(gate=48),
             backbone=DiTBackbone(layers=6, heads=6, head_dim=32),

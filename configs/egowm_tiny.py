@@ -1,19 +1,11 @@
 """EgoWM, steered by actions alone, without a map: houses at 64×64 pixels, minutes on two cores."""
 
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import (
-    ActionConfig,
-    ClipConfig,
-    Config,
-    DataConfig,
-    EgoWMConfig,
-    EgoWMTrainConfig,
-    EvalConfig,
-    StageConfig,
-)
+from pewm_jax.config import ActionConfig, ClipConfig, Config, DataConfig, EvalConfig, StageConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 
 
 def config() -> Config:
@@ -27,7 +19,7 @@ def config() -> Config:
     spot.
     """
     return Config(
-        model=EgoWMConfig(
+        model=EgoWM(
             clip=ClipConfig(height=64, width=64, depth=False),
             codec=LearnedCodecConfig(gate=48),
             backbone=DiTBackbone(layers=4, heads=4, head_dim=32),

@@ -1,15 +1,8 @@
 """The gate of a trained codec (runs/codec), on the same houses: minutes on two CPU cores."""
 
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import (
-    ClipConfig,
-    CodecTrainConfig,
-    CodecWorldConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    StageConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig
+from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 
 
 def config() -> Config:
@@ -20,7 +13,7 @@ def config() -> Config:
     """
     still = StageConfig(steps=0)
     return Config(
-        model=CodecWorldConfig(clip=ClipConfig(frames=5), codec=LearnedCodecConfig(gate=48)),
+        model=CodecTask(clip=ClipConfig(frames=5), codec=LearnedCodecConfig(gate=48)),
         data=DataConfig(path="data/codec", stride_max=3, context=12),
         train=CodecTrainConfig(
             run="runs/gate",

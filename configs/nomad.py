@@ -1,15 +1,8 @@
 """NoMaD, a policy that proposes ways to go, on walks through procedural houses of 64×64 pixels."""
 
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    NomadTrainConfig,
-    NomadWorldConfig,
-    StageConfig,
-)
-from pewm_jax.config.nomad import NomadConfig
+from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig
+from pewm_jax.models.nomad.config import NomadConfig
+from pewm_jax.worlds.nomad import NomadTask, NomadTrainConfig
 
 
 def config() -> Config:
@@ -20,7 +13,7 @@ def config() -> Config:
     0.25 m.
     """
     return Config(
-        model=NomadWorldConfig(
+        model=NomadTask(
             clip=ClipConfig(frames=20),
             policy=NomadConfig(
                 height=64,

@@ -3,15 +3,7 @@
 import dataclasses
 
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    PersistConfig,
-    PersistTrainConfig,
-    StageConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.flow import FrameFlowConfig
 from pewm_jax.memory.class_grid import GridConfig
@@ -23,6 +15,8 @@ from pewm_jax.models.persist.config import (
     VoxelVAEConfig,
 )
 from pewm_jax.models.persist.nets import PersistNetsConfig
+from pewm_jax.worlds.persist.config import PersistTrainConfig
+from pewm_jax.worlds.persist.world import PERSIST
 
 CLASSES = 73
 """Nine groups of kinds in eight colours, and nothing."""
@@ -41,7 +35,7 @@ def config() -> Config:
     voxels = FrameFlowConfig(per_frame=True, times="ends", sample_steps=1, shift=1.0, predicts="x0")
     pixels = dataclasses.replace(voxels, times="uniform", sample_steps=2, context_noise=0.1)
     return Config(
-        model=PersistConfig(
+        model=PERSIST(
             clip=ClipConfig(frames=5, height=64, width=64),
             codec=codec,
             backbone=PersistNetsConfig(

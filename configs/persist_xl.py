@@ -1,13 +1,6 @@
 """PERSIST at its published sizes: 288×512 pixels, grids of 48³ cells with 2,138 classes."""
 
-from pewm_jax.config import (
-    Config,
-    DataConfig,
-    EvalConfig,
-    PersistConfig,
-    PersistTrainConfig,
-    StageConfig,
-)
+from pewm_jax.config import Config, DataConfig, EvalConfig, StageConfig
 from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.models.persist.config import (
     BlocksConfig,
@@ -16,6 +9,8 @@ from pewm_jax.models.persist.config import (
     VoxelVAEConfig,
 )
 from pewm_jax.models.persist.nets import PersistNetsConfig
+from pewm_jax.worlds.persist.config import PersistTrainConfig
+from pewm_jax.worlds.persist.world import PERSIST
 
 
 def config() -> Config:
@@ -26,7 +21,7 @@ def config() -> Config:
     """
     blocks = BlocksConfig(remat=True)
     return Config(
-        model=PersistConfig(
+        model=PERSIST(
             backbone=PersistNetsConfig(
                 voxel_vae=VoxelVAEConfig(slab=8, convolution="xla"),
                 world_frames=VoxelDiTConfig(blocks=blocks),

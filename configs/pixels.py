@@ -1,10 +1,11 @@
 """The paper's reader on plain pixels, without a codec: 48×48 pixels, minutes on two CPU cores."""
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, StageConfig, TrainConfig
+from pewm_jax.config import ClipConfig, Config, DataConfig, StageConfig, TrainConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.worlds.pewm.world import PEWM
 
 
 def config() -> Config:
@@ -19,7 +20,7 @@ def config() -> Config:
     * memory narrower than the backbone: attention to the map is what a step's time goes to.
     """
     return Config(
-        model=ModelConfig(
+        model=PEWM(
             clip=ClipConfig(height=48, width=48),
             backbone=DiTBackbone(layers=4, heads=6, head_dim=32),
             memory=VoxelConfig(

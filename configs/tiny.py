@@ -1,25 +1,18 @@
 """Absurdly small: shows in seconds that everything runs, learns next to nothing; for tests."""
 
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    ModelConfig,
-    StageConfig,
-    TrainConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.worlds.pewm.world import PEWM
 
 
 def config() -> Config:
     """Return the settings of the tests."""
     stage = StageConfig(steps=6, batch=2, warmup=2)
     return Config(
-        model=ModelConfig(
+        model=PEWM(
             clip=ClipConfig(frames=5, height=16, width=16),
             backbone=DiTBackbone(
                 layers=2, heads=2, head_dim=16, text_length=1, text_dim=8, time_dim=16

@@ -13,19 +13,21 @@ only renders houses does not load the networks.
 """
 
 import importlib
+import warnings
 from typing import TYPE_CHECKING, Any
 
 from pewm_jax import _moved
 
 if TYPE_CHECKING:
     from pewm_jax.codecs.signals import rgb_from_signal
-    from pewm_jax.config import Config, ModelConfig
+    from pewm_jax.config import Config
     from pewm_jax.errors import ConfigError, UserError
     from pewm_jax.geometry.actions import integrate
     from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
     from pewm_jax.train.loading import load
     from pewm_jax.types import Camera, Clip, Control, Frames, VoxelMap, WorldState
     from pewm_jax.worlds import imagine, imagine_many, observe, start
+    from pewm_jax.worlds.pewm.world import PEWM
     from pewm_jax.worlds.rollouts import rollout
 
 __version__ = "0.2.0.dev0"
@@ -35,9 +37,9 @@ _HOME = {
     "Clip": "types",
     "Config": "config",
     "Control": "types",
-    "ModelConfig": "config",
     "ConfigError": "errors",
     "Frames": "types",
+    "PEWM": "worlds.pewm.world",
     "UserError": "errors",
     "VoxelMap": "types",
     "WorldState": "types",
@@ -54,13 +56,13 @@ _HOME = {
 }
 
 __all__ = [
+    "PEWM",
     "Camera",
     "Clip",
     "Config",
     "ConfigError",
     "Control",
     "Frames",
-    "ModelConfig",
     "UserError",
     "VoxelMap",
     "WorldState",
@@ -81,6 +83,13 @@ _moved.install()
 
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used."""
+    if name == "ModelConfig":  # as version 0.1 had it
+        warnings.warn(
+            "pewm_jax.ModelConfig is deprecated: import PEWM from pewm_jax.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
+        name = "PEWM"
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -45,7 +45,7 @@ class Settings:
         """Refuse a model that these settings do not fit into; called when a model is built.
 
         Args:
-            model: the ``ModelConfig`` that they are part of.
+            model: the model that they are part of.
 
         Raises:
             ConfigError: they do not fit.
@@ -60,14 +60,11 @@ class Kind:
         section: the part, such as ``backbone``.
         name: its name in JSON and flags.
         settings: its class, a frozen dataclass derived from the section's interface.
-        where: for a kind whose functions are not methods yet: the name of the module with its
-            functions, or an object with them; else None.
     """
 
     section: str
     name: str
     settings: type
-    where: Any = None
 
 
 GROUP = "pewm_jax.kinds"
@@ -75,11 +72,11 @@ GROUP = "pewm_jax.kinds"
 
 BUILT_IN: dict[str, dict[str, str]] = {
     "world": {
-        "pewm": "pewm_jax.config.model:ModelConfig",
-        "codec": "pewm_jax.config.codec_world:CodecWorldConfig",
-        "egowm": "pewm_jax.config.egowm:EgoWMConfig",
-        "persist": "pewm_jax.config.persist:PersistConfig",
-        "nomad": "pewm_jax.config.nomad:NomadWorldConfig",
+        "pewm": "pewm_jax.worlds.pewm.world:PEWM",
+        "codec": "pewm_jax.worlds.codec:CodecTask",
+        "egowm": "pewm_jax.worlds.egowm.world:EgoWM",
+        "persist": "pewm_jax.worlds.persist.world:PERSIST",
+        "nomad": "pewm_jax.worlds.nomad:NomadTask",
     },
     "backbone": {
         "dit": "pewm_jax.models.cogvideox.backbone:DiTBackbone",
@@ -126,15 +123,6 @@ BUILT_IN: dict[str, dict[str, str]] = {
 }
 """Section → name → "module:class" of the kinds of this package, imported when first used."""
 
-MODULES: dict[str, str] = {
-    "world.pewm": "pewm_jax.worlds.pewm.world",
-    "world.codec": "pewm_jax.worlds.codec",
-    "world.egowm": "pewm_jax.worlds.egowm.world",
-    "world.persist": "pewm_jax.worlds.persist.world",
-    "world.nomad": "pewm_jax.worlds.nomad",
-}
-"""The modules of the built-in kinds whose functions are not methods yet; see ``functions``."""
-
 _KINDS: dict[tuple[str, str], Kind] = {}
 _ENTERED: set[str] = set()
 """Modules of entry points that were imported, or are being imported."""
@@ -151,7 +139,7 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
         section: the part of a model, such as ``backbone``.
         name: the kind's name in JSON and flags.
         settings: a frozen dataclass, subclass of the section's interface; None makes a decorator.
-        where: a module, its name or another object with the functions, if they are not methods.
+        where: deprecated: a module with the functions of the kind, its name or another object.
 
     Returns:
         The class, or the decorator.
@@ -190,9 +178,9 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
     elif taken is not None and taken.settings.__module__ != settings.__module__:
         return taken.settings  # one file run as two modules: both hold the first class
     else:
-        if where is not None and built_in is None:
-            _add_methods(section, settings)
-        _KINDS[section, name] = Kind(section, name, settings, where)
+        if where is not None:
+            _add_methods(section, name, settings, where)
+        _KINDS[section, name] = Kind(section, name, settings)
         return settings
     raise ConfigError(f"There is a {section} {name!r} already ({found}); choose another name.")
 
@@ -213,37 +201,49 @@ _FUNCTIONS: dict[str, dict[str, str]] = {
     "encoder": {name: name for name in ("init", "encode", "preprocessing")},
     "backbone": {name: name for name in ("init", "apply", "init_image", "observed")},
     "control": {name: name for name in ("init", "condition")},
+    "world": {
+        name: name
+        for name in (
+            *("init", "stages", "sharding", "split_heads", "start", "observe", "imagine"),
+            *("imagine_many", "to_compare", "views", "memory_points", "point_colours"),
+            *("erase", "move", "coverage"),
+        )
+    },
 }
 """Section → function of a module in version 0.1 → the method that it is now."""
 _OF_THE_MODEL = {("backbone", "observed"), ("control", "init"), ("control", "condition")}
 """Functions whose first argument was the model and not the settings."""
 
 
-def _add_methods(section: str, settings: type) -> None:
+def _add_methods(section: str, name: str, settings: type, where: Any) -> None:
     """Make the functions of a module, as version 0.1 had them, methods of the settings."""
+    warnings.warn(
+        f"register({section!r}, …) with a module of functions is deprecated: make them methods "
+        f"of {settings.__name__}, as pewm_jax.config documents them.",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+
+    def find(function: str) -> Any:
+        module = imported(where, f"{section} of kind {name!r}") if isinstance(where, str) else where
+        return getattr(module, function, None)
+
     for function, method in _FUNCTIONS.get(section, {}).items():
-        setattr(settings, method, _method(section, settings, function, method))
-    if section in _FUNCTIONS:
-        warnings.warn(
-            f"register({section!r}, …) with a module of functions is deprecated: make them methods "
-            f"of {settings.__name__}, as pewm_jax.config.parts documents them.",
-            DeprecationWarning,
-            stacklevel=3,
-        )
-        rules = property(lambda self: getattr(functions(self), "SHARDING", ()))
-        settings.SHARDING = rules  # type: ignore[attr-defined]
+        of_model = (section, function) in _OF_THE_MODEL
+        inherited = getattr(settings, method)
+        setattr(settings, method, _method(find, function, inherited, of_model=of_model))
+    if hasattr(settings, "SHARDING"):
+        settings.SHARDING = property(lambda _: find("SHARDING") or ())  # type: ignore[attr-defined]
 
 
-def _method(section: str, settings: type, function: str, method: str) -> Any:
+def _method(find: Any, function: str, inherited: Any, *, of_model: bool) -> Any:
     """Return a method that calls a module's function; the inherited one if there is none."""
-    inherited = getattr(settings, method)
 
     def call(self: Any, *args: Any, **named: Any) -> Any:
-        own = getattr(functions(self), function, None)
+        own = find(function)
         if own is None:
             return inherited(self, *args, **named)
-        given = args if (section, function) in _OF_THE_MODEL else (self, *args)
-        return own(*given, **named)
+        return own(*args, **named) if of_model else own(self, *args, **named)
 
     return call
 
@@ -323,7 +323,7 @@ def named(section: str, name: str) -> Kind:
         if (section, name) not in _KINDS and name in BUILT_IN.get(section, {}):
             module, _, attribute = BUILT_IN[section][name].partition(":")
             settings = getattr(imported(module, f"{section} of kind {name!r}"), attribute)
-            register(section, name, settings, MODULES.get(f"{section}.{name}"))
+            register(section, name, settings)
         if (section, name) not in _KINDS:
             failed = _import_entry_points()
         if (section, name) in _KINDS:
@@ -392,20 +392,6 @@ def of(settings: Any) -> Kind:
         f"{kind.__name__} is not registered: call pewm_jax.config.register(section, name, "
         f"{kind.__name__}) once, where it is defined."
     )
-
-
-def functions(settings: Any) -> Any:
-    """Return the object with the functions of settings: themselves, if they have methods.
-
-    Raises:
-        ConfigError: their type is not registered, or the module cannot be imported.
-    """
-    kind = of(settings)
-    if kind.where is None:
-        return settings
-    if not isinstance(kind.where, str):
-        return kind.where
-    return imported(kind.where, f"{kind.section} of kind {kind.name!r}")
 
 
 def require_section(value: Any, section: str, where: str) -> None:

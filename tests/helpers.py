@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ClipConfig, Config, ModelConfig
+from pewm_jax.config import ClipConfig, Config
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import cameras
 from pewm_jax.memory.voxel_map import VoxelConfig
@@ -16,8 +16,9 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import world_model
+from pewm_jax.worlds.pewm.world import PEWM
 
-TINY = ModelConfig(
+TINY = PEWM(
     clip=ClipConfig(frames=9, height=16, width=24),
     codec=PixelConfig(spatial=4),
     backbone=DiTBackbone(
@@ -38,17 +39,17 @@ TINY = ModelConfig(
 
 def tiny_config(**sections) -> Config:
     """Return a tiny experiment; sections are the model's, or data, train and evaluate."""
-    of_model = {field.name for field in dataclasses.fields(ModelConfig)} & sections.keys()
+    of_model = {field.name for field in dataclasses.fields(PEWM)} & sections.keys()
     model = tiny_model(**{name: sections.pop(name) for name in of_model})
     return Config(model=model, **sections)
 
 
-def tiny_model(**sections) -> ModelConfig:
+def tiny_model(**sections) -> PEWM:
     """Return a tiny model with other sections: ``tiny_model(noise=…)``."""
     return dataclasses.replace(TINY, **sections)
 
 
-def with_reader(model: ModelConfig, **changes) -> ModelConfig:
+def with_reader(model: PEWM, **changes) -> PEWM:
     """Return a model whose reader of the memory has other settings."""
     reader = dataclasses.replace(model.memory.reader, **changes)
     return dataclasses.replace(model, memory=dataclasses.replace(model.memory, reader=reader))

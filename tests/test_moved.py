@@ -93,6 +93,25 @@ def test_classes_that_left_the_settings_are_found_there_with_a_warning():
         config.nothing  # noqa: B018
 
 
+def test_the_worlds_that_left_the_settings_are_the_same_classes():
+    import pewm_jax
+    from pewm_jax import config
+    from pewm_jax.worlds.egowm.world import EgoWM
+    from pewm_jax.worlds.pewm.world import PEWM
+
+    with pytest.warns(DeprecationWarning, match=r"ModelConfig is deprecated: import PEWM from"):
+        assert pewm_jax.ModelConfig is pewm_jax.PEWM is PEWM
+    with pytest.warns(DeprecationWarning, match="import EgoWM from pewm_jax.worlds.egowm.world"):
+        assert isinstance(EgoWM(), config.EgoWMConfig)
+    sys.modules.pop("pewm_jax.config.model", None)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        from pewm_jax.config.model import ModelConfig
+    assert ModelConfig is PEWM
+    assert len(seen) >= 2, "of the module and of the class"
+    assert isinstance(ModelConfig(), ModelConfig)
+
+
 def test_an_unknown_module_is_not_found():
     with pytest.raises(ModuleNotFoundError, match="nowhere"):
         importlib.import_module("pewm_jax.nowhere")

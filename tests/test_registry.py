@@ -8,10 +8,11 @@ import sys
 import textwrap
 import types
 
+import numpy as np
 import pytest
 
 from pewm_jax import config as configuration
-from pewm_jax import presets
+from pewm_jax import presets, worlds
 from pewm_jax import registry as kinds
 from pewm_jax.cli import flags
 from pewm_jax.cli import main as program
@@ -23,7 +24,6 @@ from pewm_jax.config import (
     Config,
     ConfigError,
     Memory,
-    ModelConfig,
     Noise,
     World,
     register,
@@ -34,6 +34,9 @@ from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import runtime
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.types import Camera, Frames, WorldState
+from pewm_jax.worlds.pewm.world import PEWM
+from pewm_jax.worlds.stages import Stage
 from tests.examples import parts
 
 TINY = presets.load("tiny")
@@ -211,7 +214,7 @@ def cell(module="__main__"):
 def test_a_cell_that_is_run_again_takes_the_place_of_the_first():
     first, second = cell(), cell()
     assert register("noise", "cell", first) is first
-    made = ModelConfig(noise=first())
+    made = PEWM(noise=first())
     register("noise", "cell", second)
     assert kinds.named("noise", "cell").settings is second
     assert configuration.to_dict(made)["noise"]["kind"] == "cell"
@@ -250,6 +253,28 @@ def test_a_module_of_functions_goes_on_working_with_a_warning():
     assert old().prediction_target(0.0, 5.0, 1.0) == 5.0
     with pytest.raises(NotImplementedError):
         old().draw(None, 1, 1)
+
+
+def test_a_world_with_a_module_of_functions_goes_on_working_with_a_warning():
+    @dataclasses.dataclass(frozen=True)
+    class Former(World):
+        size: int = 3
+
+    frames = Frames(np.zeros((1, 2, 2, 3)), np.ones((1, 2, 2)), Camera(np.ones((1, 4)), np.eye(4)))
+    mine = types.SimpleNamespace(
+        init=lambda model, key: {"kernel": np.zeros(model.size)},
+        stages=lambda model: (Stage("fit", 1, ((".*", "train"),), mine.init, print),),
+        observe=lambda model, params, state, frames: WorldState(frames, params["kernel"]),
+        imagine=lambda model, *given, **named: None,
+    )
+    with pytest.warns(DeprecationWarning, match="make them methods of Former"):
+        register("world", "former", Former, mine)
+    model = Former(size=4)
+    params = worlds.init(model, None)
+    assert params["kernel"].shape == (4,)
+    assert [stage.name for stage in worlds.stages(model)] == ["fit"]
+    assert model.start(params, frames).map is params["kernel"]
+    assert worlds.sharding(model)[0][0] == ".*"
 
 
 def test_a_module_that_is_reloaded_registers_anew(tmp_path, monkeypatch):
@@ -295,14 +320,14 @@ def test_what_is_no_settings_of_a_section_cannot_be_registered(settings, sentenc
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
-        (lambda: ModelConfig(noise=PixelConfig()), "model.noise is PixelConfig: .* DDPMConfig"),
-        (lambda: ModelConfig(memory=None), "model.memory is NoneType"),
-        (lambda: ModelConfig(control=CameraConfig), "model.control is the class CameraConfig"),
-        (lambda: ModelConfig(noise=Plain()), "model.noise is Plain"),
-        (lambda: ModelConfig(clip=None), "model.clip is NoneType: give it a ClipConfig"),
-        (lambda: ModelConfig(actions=ClipConfig()), "model.actions is ClipConfig"),
+        (lambda: PEWM(noise=PixelConfig()), "model.noise is PixelConfig: .* DDPMConfig"),
+        (lambda: PEWM(memory=None), "model.memory is NoneType"),
+        (lambda: PEWM(control=CameraConfig), "model.control is the class CameraConfig"),
+        (lambda: PEWM(noise=Plain()), "model.noise is Plain"),
+        (lambda: PEWM(clip=None), "model.clip is NoneType: give it a ClipConfig"),
+        (lambda: PEWM(actions=ClipConfig()), "model.actions is ClipConfig"),
         (
-            lambda: ModelConfig(memory=VoxelConfig(encoder=AttentionConfig())),
+            lambda: PEWM(memory=VoxelConfig(encoder=AttentionConfig())),
             "model.memory.encoder is AttentionConfig",
         ),
         (lambda: Config(model=PixelConfig()), "model is PixelConfig: .* 'world'"),
@@ -320,7 +345,7 @@ def test_functions_that_cannot_be_imported_are_refused_with_the_reason():
     with pytest.warns(DeprecationWarning, match="make them methods of Cell"):
         register("noise", "gone", gone, "no_such_module.noise")
     with pytest.raises(ConfigError, match=r"noise of kind 'gone': .*no_such_module") as refusal:
-        kinds.functions(gone())
+        gone().levels()
     assert "ModuleNotFoundError" in one_sentence(refusal)
 
 
@@ -369,9 +394,17 @@ class Other(World):
     noise: Noise = DDPM
     dtype: str = "float32"
 
+    def init(self, key): ...
+
+    def stages(self): ...
+
+    def observe(self, params, state, frames): ...
+
+    def imagine(self, params, state, control, key, *, remember=True, memory=True): ...
+
 
 def test_a_world_is_chosen_before_its_parts(tmp_path):
-    register("world", "other", Other, "json")
+    register("world", "other", Other)
     words = ["--model.noise.kind", "flow", "--model.kind", "other"]
     found, rest = flags.take_kinds(words, TINY)
     assert (type(found.model), type(found.model.noise).__name__, rest) == (Other, "FlowConfig", [])

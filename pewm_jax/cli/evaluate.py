@@ -10,6 +10,7 @@ import tyro
 
 from pewm_jax import config as configuration
 from pewm_jax import presets, shipped
+from pewm_jax import registry as kinds
 from pewm_jax.cli import parser
 from pewm_jax.cli.parser import Flat
 from pewm_jax.config import Config, EvalConfig, Join, World
@@ -64,7 +65,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     """Write the report and print its path."""
     run = settings.run
     config = _read_config(Path(run))
-    if config is not None and isinstance(config.model, configuration.CodecWorldConfig):
+    if config is not None and kinds.of(config.model).name == "codec":
         if settings.join.distributed:
             raise ConfigError(
                 f"{run} contains a codec, which one process evaluates: omit --distributed."

@@ -95,12 +95,12 @@ def _measure(
     """
     import numpy as np
 
-    from pewm_jax.config import PersistConfig
     from pewm_jax.data.dataset import EpisodeSource
     from pewm_jax.data.loader import require_same_cells
     from pewm_jax.eval import horizon, voxel_trials
     from pewm_jax.eval.metrics.videos import read_i3d
     from pewm_jax.models.i3d import convert as i3d_weights
+    from pewm_jax.worlds.persist.world import PERSIST
 
     i3d = read_i3d(i3d_weights.find(None), "fvd") if settings.fvd == "on" else None
     episodes = EpisodeSource(settings.data / settings.split)
@@ -115,7 +115,7 @@ def _measure(
     require_same_cells(config.model, chosen[0])
     walks = [horizon.read_walk(one, first, ends[-1], settings.context) for one in chosen]
     tried = _trial_walks(settings, chosen, first)
-    of_voxels = isinstance(config.model, PersistConfig)
+    of_voxels = isinstance(config.model, PERSIST)
     if tried:  # fail before hours of imagining
         if not of_voxels:
             raise ConfigError("--trials places blocks in a voxel world; this world has no voxels.")

@@ -10,14 +10,14 @@ from jax.core import Tracer
 
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.geometry import depth_images
 from pewm_jax.nn import placement
 from pewm_jax.types import Array, Params, View
 
 
 def encode_rgbd(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     rgb_BTHWC: Array,
     depth_BTHW: Array,
@@ -74,7 +74,7 @@ def _clip_by_clip(encoded: Callable[..., Array], weights: Params, *videos: Array
     return placement.by_batch(one_by_one if traced else encoded, weights, *videos)
 
 
-def decode_rgbd(model: ModelConfig, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
+def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
     """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W).
 
     Where depth is not encoded it is 0 everywhere: not known.
@@ -95,7 +95,7 @@ def decode_rgbd(model: ModelConfig, params: Params, latents_BthwC: Array) -> tup
 
 
 def mix(
-    model: ModelConfig, params: Params, rgb_BTHWC: Array, depth_BTHW: Array, view: View
+    model: AssembledModel, params: Params, rgb_BTHWC: Array, depth_BTHW: Array, view: View
 ) -> tuple[Array, Array]:
     """Mix decoded frames with what the memory looks like from their cameras, by the codec's gate.
 
@@ -124,7 +124,7 @@ def mix(
     return jnp.clip(made[..., :3], -1, 1), depth
 
 
-def measured(model: ModelConfig, depth_BTHW: Array) -> Array:
+def measured(model: AssembledModel, depth_BTHW: Array) -> Array:
     """Return the share of measured pixels in each depth latent, the weight of its error.
 
     The shape (B, t, h, w, C) broadcasts with the depth channels of ``encode_rgbd``. If a channel is

@@ -1,4 +1,4 @@
-"""Every setting of the library: frozen dataclasses, validated when built, to and from JSON.
+"""The settings of an experiment: frozen dataclasses, validated when built, to and from JSON.
 
 A field's docstring is its ``--help`` text. Values that cannot work are refused when a configuration
 is built, in a sentence that names the fix; other code does not check them again.
@@ -8,15 +8,12 @@ import importlib
 import warnings
 from typing import Any
 
+from pewm_jax.config.assembled import AssembledModel
 from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
-from pewm_jax.config.codec_world import CodecTrainConfig, CodecWorldConfig
-from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.launch import Join, Launch
 from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
-from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.nomad import NomadConfig, NomadTrainConfig, NomadWorldConfig
 from pewm_jax.config.parts import (
     Backbone,
     Codec,
@@ -27,33 +24,28 @@ from pewm_jax.config.parts import (
     Noise,
     Reader,
 )
-from pewm_jax.config.persist import POINT_WAVES, PersistConfig, PersistTrainConfig
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, Task, World
 from pewm_jax.errors import ConfigError, UserError
-from pewm_jax.registry import Settings, functions, register
+from pewm_jax.registry import Settings, register
 
 __all__ = [
     "AXES",
-    "POINT_WAVES",
     "SMALLEST",
     "VERSION",
     "ActionConfig",
     "ArraySpec",
+    "AssembledModel",
     "Backbone",
     "BatchSpec",
     "Capabilities",
     "ClipConfig",
     "Codec",
-    "CodecTrainConfig",
-    "CodecWorldConfig",
     "Conditioner",
     "Config",
     "ConfigError",
     "DataConfig",
-    "EgoWMConfig",
-    "EgoWMTrainConfig",
     "Encoder",
     "EvalConfig",
     "Facts",
@@ -62,13 +54,7 @@ __all__ = [
     "Launch",
     "Memory",
     "MeshConfig",
-    "ModelConfig",
     "Noise",
-    "NomadConfig",
-    "NomadTrainConfig",
-    "NomadWorldConfig",
-    "PersistConfig",
-    "PersistTrainConfig",
     "Reader",
     "Settings",
     "StageConfig",
@@ -78,7 +64,6 @@ __all__ = [
     "UserError",
     "World",
     "from_dict",
-    "functions",
     "load",
     "register",
     "save",
@@ -136,6 +121,17 @@ _MOVED = {
     "Places": "pewm_jax.config.parts:InjectionPoints",
     "ReaderSettings": "pewm_jax.config.parts:Reader",
     "WorldSettings": "pewm_jax.config.world:World",
+    "ModelConfig": "pewm_jax.worlds.pewm.world:PEWM",
+    "EgoWMConfig": "pewm_jax.worlds.egowm.world:EgoWM",
+    "EgoWMTrainConfig": "pewm_jax.worlds.egowm.world",
+    "PersistConfig": "pewm_jax.worlds.persist.world:PERSIST",
+    "PersistTrainConfig": "pewm_jax.worlds.persist.config",
+    "POINT_WAVES": "pewm_jax.worlds.persist.config",
+    "CodecWorldConfig": "pewm_jax.worlds.codec:CodecTask",
+    "CodecTrainConfig": "pewm_jax.worlds.codec",
+    "NomadConfig": "pewm_jax.models.nomad.config",
+    "NomadTrainConfig": "pewm_jax.worlds.nomad",
+    "NomadWorldConfig": "pewm_jax.worlds.nomad:NomadTask",
 }
 """Names that version 0.1 had here → the module that has them now, and the name if it is another."""
 

@@ -278,7 +278,7 @@ class Conditioner(Settings):
         """Return the number of channels, at the latent rate, that it adds to the denoiser's input.
 
         Args:
-            model: the ``ModelConfig`` that it is part of.
+            model: the ``AssembledModel`` that it is part of.
         """
         del model
         return 0

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pewm_jax.config.clip import ActionConfig, ClipConfig
@@ -127,7 +128,7 @@ class Facts:
 
 
 class Task(Settings):
-    """Base class of the settings of what is trained; see ``pewm_jax.worlds`` for its functions.
+    """Base class of what is trained: its settings and its methods.
 
     Attributes:
         TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
@@ -187,19 +188,12 @@ class Task(Settings):
 
 
 class World(Task):
-    """Base class of the settings of a world.
+    """Base class of a world.
 
-    A world overrides ``observe`` and ``imagine`` and the methods that its capabilities name. It may
-    have four further ones, for which there are defaults:
-
-    * ``start(params, frames)`` returns the state after S ≥ 1 observed frames (S, H, W, …), the last
-      of which is the present. By default ``observe`` makes it from a state whose memory is None.
-    * ``imagine_many(params, state, controls, keys, *, memory=True, last=False)`` imagines K
-      candidates from one state; see ``worlds.imagine_many``. By default ``imagine`` is vmapped.
-    * ``to_compare(state)`` returns a smaller state that ``imagine_many`` takes as well.
-    * ``views(params, state)`` returns what computes the candidates' common views, or None.
-
-    All methods are pure functions of arrays, traced by ``jax.jit`` with the settings static.
+    A world overrides ``observe`` and ``imagine`` and the methods that its capabilities name. The
+    methods are pure functions of arrays. ``pewm_jax.worlds`` has a function for each, which checks
+    the arguments and compiles ``start``, ``observe``, ``imagine`` and ``imagine_many`` by
+    ``jax.jit`` with the settings static.
 
     Attributes:
         actions: what one discrete action does to the agent.
@@ -226,6 +220,17 @@ class World(Task):
         """
         del steps
         return self
+
+    def start(self, params: Params, frames: Frames) -> WorldState:
+        """Begin a world; by default, observe from a state whose memory is None.
+
+        Args:
+            params: the parameters.
+            frames: S ≥ 1 frames (S, H, W, …), as for ``observe``; the last one is the present.
+        """
+        from pewm_jax.types import WorldState  # noqa: PLC0415 - reading settings needs no JAX
+
+        return self.observe(params, WorldState(frames, None), frames)
 
     @abc.abstractmethod
     def observe(self, params: Params, state: WorldState, frames: Frames) -> WorldState:
@@ -268,6 +273,44 @@ class World(Task):
             The state whose present frame is the last one, and the n frames, colours float32 in
             [−1, 1]; depth is zero where ``capabilities.depth`` is False.
         """
+
+    def imagine_many(
+        self,
+        params: Params,
+        state: WorldState,
+        controls: Any,
+        keys: Array,
+        *,
+        memory: bool = True,
+        last: bool = False,
+    ) -> tuple[WorldState, Frames]:
+        """Imagine K candidates from one state; by default, vmap ``imagine``.
+
+        ``pewm_jax.worlds.imagine_many`` documents arguments and result. A world whose ``views``
+        returns a function takes its result as the further argument ``views``.
+        """
+        import jax  # noqa: PLC0415 - reading settings does not need it
+
+        from pewm_jax.types import WorldState  # noqa: PLC0415
+
+        def candidate(control: Any, key: Array) -> tuple[Frames, Frames]:
+            after, frames = self.imagine(params, state, control, key, remember=False, memory=memory)
+            return after.frame, frames
+
+        present, frames = jax.vmap(candidate)(controls, keys)
+        frames = jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
+        return WorldState(present, state.map), frames
+
+    def to_compare(self, state: WorldState) -> WorldState:
+        """Return a state for ``imagine_many`` alone, whose memory may be smaller; not under jit."""
+        return state
+
+    def views(self, params: Params, state: WorldState) -> Callable[[Any], Any] | None:
+        """Return a function from K controls to ``imagine_many``'s ``views``; not under jit.
+
+        None where candidates have no views to share.
+        """
+        del params, state
 
     def memory_points(self, memory: Any) -> tuple[Array, Array, Array, Array | None]:
         """Return the memory as points, where ``capabilities.points`` says so.

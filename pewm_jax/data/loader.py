@@ -18,7 +18,7 @@ import grain
 import numpy as np
 
 from pewm_jax.config import Config, ConfigError, UserError
-from pewm_jax.config.model import World
+from pewm_jax.config.world import World
 from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode

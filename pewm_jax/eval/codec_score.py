@@ -17,7 +17,7 @@ import numpy as np
 
 from pewm_jax import shipped
 from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth, signal_from_rgb
-from pewm_jax.config import CodecWorldConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.runner import print_now
@@ -26,6 +26,7 @@ from pewm_jax.io import atomic
 from pewm_jax.io.store import file_hash
 from pewm_jax.train import runs
 from pewm_jax.types import Array, Frames, Params
+from pewm_jax.worlds.codec import CodecTask
 from pewm_jax.worlds.rollouts import load_finished
 
 FRAMES = 16
@@ -58,7 +59,7 @@ def score(
     """
     home, run = shipped.home(run), shipped.find(run)
     config, params = load_finished(run)
-    if not isinstance(config.model, CodecWorldConfig):
+    if not isinstance(config.model, CodecTask):
         raise UserError(f"{run} contains a world model, not a codec: use pewm-jax evaluate.")
     if not runs.is_finished(run, config):
         raise UserError(
@@ -99,7 +100,7 @@ def score(
     return path
 
 
-def measures(model: CodecWorldConfig, params: Params, frames: Frames) -> dict[str, Array]:
+def measures(model: CodecTask, params: Params, frames: Frames) -> dict[str, Array]:
     """Return reconstruction errors of one episode's frames, encoded and decoded.
 
     Args:

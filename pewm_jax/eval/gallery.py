@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.clips import ClipChoice, load_clip
@@ -179,12 +178,12 @@ def _above(config: Config, long: LongRollouts, index: int, item: _Rollout) -> np
     poses = np.asarray(item.context.camera.world_from_camera)
     later = np.asarray(item.truth.camera.world_from_camera)
     ceiling = poses[-1, 2, 3] + ABOVE_CAMERA_M
-    clouds, colours = [], worlds.function(config.model, "point_colours")
+    clouds = []
     for when in ("first", "last"):
         valid = kept[f"{when}_valid"][index] & (kept[f"{when}_points"][index][:, 2] < ceiling)
         points = kept[f"{when}_points"][index][valid]
-        shades = np.asarray(colours(config.model, kept[f"{when}_features"][index][valid]))
-        clouds.append((points, as_bytes(shades)))
+        shades = config.model.point_colours(kept[f"{when}_features"][index][valid])
+        clouds.append((points, as_bytes(np.asarray(shades))))
     bounds = map_bounds(*[points for points, _ in clouds], poses[:, :3, 3])
     panels = []
     tracks = [("after the observed frames", poses), ("after the imagined frames", later)]

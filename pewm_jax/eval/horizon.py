@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import Config, PersistConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.metrics.videos import DISTANCES, VideoDistance
@@ -27,6 +27,7 @@ from pewm_jax.io.progress import Meter
 from pewm_jax.report.pictures import as_bytes
 from pewm_jax.types import Camera, Control, Params
 from pewm_jax.worlds.persist import world as persist
+from pewm_jax.worlds.persist.world import PERSIST
 
 WINDOW = 16
 """Frames per window."""
@@ -133,7 +134,7 @@ def imagine_walks(
 
 def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> np.ndarray:
     """Return the frames that a ``persist`` world renders from the true voxels and cameras."""
-    model: PersistConfig = config.model
+    model: PERSIST = config.model
     render = functools.partial(persist.render_true, model)
     render = jax.jit(jax.vmap(render, (None, 0, 0, 0, 0, 0)))
     state = _start_from_grids(config, params, walks)

@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.clips import ClipChoice, long_choices
@@ -156,14 +155,12 @@ def occupied(config: Config, maps: Any) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _occupied(config: Config, maps: Any) -> jax.Array:
-    points = worlds.function(config.model, "memory_points")
-    return jax.vmap(lambda one: points(config.model, one)[2].sum())(maps)
+    return jax.vmap(lambda one: config.model.memory_points(one)[2].sum())(maps)
 
 
 def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
     maps = jax.tree.map(lambda leaf: leaf[:shown], maps)
-    listed = functools.partial(worlds.function(config.model, "memory_points"), config.model)
-    points, features, valid, _ = jax.vmap(listed)(maps)
+    points, features, valid, _ = jax.vmap(config.model.memory_points)(maps)
     return {
         f"{when}_points": np.asarray(points),
         f"{when}_features": np.asarray(features),

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Config, PersistConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.eval.horizon import RecordedWalk
 from pewm_jax.geometry.actions import heading
 from pewm_jax.io.progress import Meter
@@ -29,6 +29,7 @@ from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.types import Array, Params, WorldState
 from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist import world as persist
+from pewm_jax.worlds.persist.world import PERSIST
 
 AHEAD_M = (1.25, 1.75, 2.25, 0.75)
 """Distances in front of the agent at which a block may be placed, metres, in order of
@@ -80,7 +81,7 @@ class Trials:
         }
 
 
-def room(model: PersistConfig, state: WorldState, floor_z: float) -> np.ndarray | None:
+def room(model: PERSIST, state: WorldState, floor_z: float) -> np.ndarray | None:
     """Return a box (2, 3), metres, of empty cells on the floor in front of the agent, or None."""
     cells = np.asarray(state.map.classes_XYZ)
     low, size = np.asarray(state.map.low_3), windows.cell_m(model)
@@ -140,11 +141,10 @@ def run(
     Raises:
         UserError: see ``block_class``.
     """
-    model: PersistConfig = config.model
+    model: PERSIST = config.model
     number = block_class(config, walks, name)
     start = jax.jit(functools.partial(persist.start_in, model))
-    imagine = functools.partial(persist.imagine, model)
-    imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
+    imagine = jax.jit(jax.vmap(model.imagine, (None, 0, 0, 0)))
     look = jax.jit(functools.partial(_rays_on_block, model))
     ready: list[_Trial] = []
     looked = 0
@@ -217,14 +217,14 @@ class _Trial(NamedTuple):
     cells: int
 
 
-def _cells(model: PersistConfig, grid: ClassGrid, box_23: np.ndarray, number: int) -> int:
+def _cells(model: PERSIST, grid: ClassGrid, box_23: np.ndarray, number: int) -> int:
     """Return the number of cells of a box that have a class."""
     held = class_grid.copy(model.memory, grid, jnp.asarray(box_23))
     return int((held.classes_XYZ == number).sum())
 
 
 def _rays_on_block(
-    model: PersistConfig, grid: ClassGrid, camera: Any, box_23: Any
+    model: PERSIST, grid: ClassGrid, camera: Any, box_23: Any
 ) -> tuple[Array, Array]:
     """Return which rays first hit a cell of a box, and whether the window contains such a cell.
 
@@ -264,7 +264,7 @@ EVERY = 40
 
 
 def reconstruction_shares(
-    model: PersistConfig, params: Params, grids: Sequence[np.ndarray]
+    model: PERSIST, params: Params, grids: Sequence[np.ndarray]
 ) -> dict[str, float]:
     """Return the shares of cells whose class the autoencoder reconstructs.
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import Memory, ModelConfig, Reader
+from pewm_jax.config import AssembledModel, Memory, Reader
 from pewm_jax.data.voxels import VoxelsConfig, table_colours
 from pewm_jax.errors import UserError, require
 from pewm_jax.geometry import march
@@ -254,7 +254,7 @@ class GridConfig(Memory):
             "may lie off the agent, by an even number more than the window.",
         )
 
-    def empty(self, model: ModelConfig, centre_3: Array) -> ClassGrid:
+    def empty(self, model: AssembledModel, centre_3: Array) -> ClassGrid:
         """Return a grid of unknown cells.
 
         Args:
@@ -271,7 +271,7 @@ class GridConfig(Memory):
         unknown = jnp.full(self.cells, UNKNOWN, jnp.int16)
         return ClassGrid(unknown, jnp.concatenate([low_xy, low_z[None]]))
 
-    def to_points(self, model: ModelConfig, memory: ClassGrid) -> tuple[Array, Array, Array]:
+    def to_points(self, model: AssembledModel, memory: ClassGrid) -> tuple[Array, Array, Array]:
         """Return centres, colours in [−1, 1] and occupancy of all cells."""
         del model
         points = centres(self, memory).reshape(-1, 3)
@@ -279,7 +279,7 @@ class GridConfig(Memory):
         return points, _colours(self)[jnp.maximum(ids, 0)], ids > 0
 
     def render(
-        self, model: ModelConfig, memory: ClassGrid, camera: Camera, height: int, width: int
+        self, model: AssembledModel, memory: ClassGrid, camera: Camera, height: int, width: int
     ) -> View:
         """Render the cells in the colours of their classes, by ray marching.
 
@@ -300,7 +300,7 @@ class GridConfig(Memory):
 
     def insert(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         memory: ClassGrid,
         frames: Frames,
@@ -319,7 +319,7 @@ class GridConfig(Memory):
             "A grid of classes takes no frames by itself: use pewm_jax.start and pewm_jax.observe."
         )
 
-    def read(self, model: ModelConfig, memory: ClassGrid, camera: Camera) -> NoReturn:
+    def read(self, model: AssembledModel, memory: ClassGrid, camera: Camera) -> NoReturn:
         """Refuse: nothing attends to the cells.
 
         Raises:
@@ -328,14 +328,14 @@ class GridConfig(Memory):
         del model, memory, camera
         raise UserError("A grid of classes has no tokens: the world persist renders it by rays.")
 
-    def erase(self, model: ModelConfig, memory: ClassGrid, box_23: Array) -> ClassGrid:
+    def erase(self, model: AssembledModel, memory: ClassGrid, box_23: Array) -> ClassGrid:
         """Empty a box; see ``erase``."""
         del model
         return erase(self, memory, box_23)
 
     def move(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         memory: ClassGrid,
         box_23: Array,
         transform: Array,

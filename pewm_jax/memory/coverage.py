@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.config import AssembledModel, Memory
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.memory import cells, rendering
@@ -49,7 +49,7 @@ class Coverage:
 
 
 def coverage(
-    model: ModelConfig,
+    model: AssembledModel,
     memory: memories.Memory,
     tokens: MapTokens,
     frames: Frames,
@@ -123,7 +123,7 @@ def _among(config: Memory, cell: Array, cell_V: Array, valid_V: Array, reach: in
     return found
 
 
-def _looked(model: ModelConfig, reader: object, camera: Camera, tokens: MapTokens) -> Array:
+def _looked(model: AssembledModel, reader: object, camera: Camera, tokens: MapTokens) -> Array:
     """Return (T, M) bool: the tokens that each frame's camera attends to."""
     frames, count = len(camera.world_from_camera), len(tokens.valid_M)
     if not isinstance(reader, AttentionConfig) or reader.positions != "projective":

@@ -14,7 +14,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.config import AssembledModel, Memory
 from pewm_jax.errors import require, require_positive
 from pewm_jax.memory import cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
@@ -85,11 +85,11 @@ class ImagesConfig(Memory):
     snapshots: int = 8
     """Frames that are kept; together they have at most `tokens` patches."""
 
-    def patch_grid(self, model: ModelConfig) -> tuple[int, int]:
+    def patch_grid(self, model: AssembledModel) -> tuple[int, int]:
         """Return a snapshot's rows and columns of patches; all snapshots fit into ``tokens``."""
         return cells.grid_of(model.clip.height, model.clip.width, self.tokens // self.snapshots)
 
-    def empty(self, model: ModelConfig, centre_3: Array) -> Snapshots:
+    def empty(self, model: AssembledModel, centre_3: Array) -> Snapshots:
         """Return an empty set of snapshots, with a grid centred on a world position."""
         count, patches = self.snapshots, math.prod(self.patch_grid(model))
         covers = math.prod(cells.grid_of(model.clip.height, model.clip.width, MOST))
@@ -104,7 +104,7 @@ class ImagesConfig(Memory):
 
     def insert(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         memory: Snapshots,
         frames: Frames,
@@ -157,7 +157,7 @@ class ImagesConfig(Memory):
             dropped=memory.dropped + missed,
         )
 
-    def to_points(self, model: ModelConfig, memory: Snapshots) -> tuple[Array, Array, Array]:
+    def to_points(self, model: AssembledModel, memory: Snapshots) -> tuple[Array, Array, Array]:
         """Return all patches as ``(points_world_V3, features_VF, valid_V)``."""
         del model
         channels = memory.features_KPF.shape[-1]
@@ -167,7 +167,7 @@ class ImagesConfig(Memory):
             memory.valid_KP.reshape(-1),
         )
 
-    def read(self, model: ModelConfig, memory: Snapshots, camera: Camera) -> MapTokens:
+    def read(self, model: AssembledModel, memory: Snapshots, camera: Camera) -> MapTokens:
         """Return all patches of all snapshots, padded with masked tokens to ``tokens``."""
         del camera
         parts = self.to_points(model, memory)

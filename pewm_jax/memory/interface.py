@@ -24,10 +24,9 @@ from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from pewm_jax.codecs import rgbd
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.memory import rendering
 from pewm_jax.types import (
     Array,
@@ -37,6 +36,7 @@ from pewm_jax.types import (
     MemoryReadout,
     Params,
     View,
+    WorldState,
 )
 
 Memory: TypeAlias = Any
@@ -46,7 +46,7 @@ NEAR = 1.5
 
 
 def insert(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     memory: Memory,
     frames: Frames,
@@ -72,7 +72,7 @@ def insert(
     )
 
 
-def trusted(model: ModelConfig, frames: Frames) -> Frames:
+def trusted(model: AssembledModel, frames: Frames) -> Frames:
     """Return imagined frames with a depth of 0 where it must not be inserted.
 
     These pixels are beyond ``memory.imagined_far`` of ``clip.far_m`` (unobserved walls are imagined
@@ -104,7 +104,7 @@ def trusted(model: ModelConfig, frames: Frames) -> Frames:
 
 
 def render(
-    model: ModelConfig, memory: Memory, camera: Camera, height: int, width: int
+    model: AssembledModel, memory: Memory, camera: Camera, height: int, width: int
 ) -> rendering.View:
     """Render the memory for cameras; nearer points occlude farther ones.
 
@@ -131,19 +131,19 @@ def render(
     return rendering.splat_cells(points, shown, cell_m, valid, camera, height, width)
 
 
-def shows_colours(model: ModelConfig) -> bool:
+def shows_colours(model: AssembledModel) -> bool:
     """Tell whether the first three channels of the memory's pictures are the colours seen."""
     return model.memory.REMEMBERS and not model.memory.KEEPS_FEATURES
 
 
-def gated(model: ModelConfig) -> bool:
+def gated(model: AssembledModel) -> bool:
     """Tell whether the codec's gate blends decoded frames with the rendered memory."""
     gate = bool(getattr(model.codec, "gate", 0))
     return gate and model.clip.depth and shows_colours(model)
 
 
 def readout(
-    model: ModelConfig,
+    model: AssembledModel,
     memory: Memory,
     camera: Camera,
     *,
@@ -179,7 +179,7 @@ def readout(
     return MemoryReadout(seen, view, encoded)
 
 
-def encode(model: ModelConfig, params: Params, view: View) -> EncodedView:
+def encode(model: AssembledModel, params: Params, view: View) -> EncodedView:
     """Encode a view of colours as the clip's frames are encoded.
 
     The codec knows whole images: a pixel that shows nothing gets colour and depth of the nearest
@@ -198,7 +198,7 @@ def encode(model: ModelConfig, params: Params, view: View) -> EncodedView:
 
 
 def from_context(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     context: Frames,
     valid_S: Array,
@@ -225,9 +225,28 @@ def from_context(
     return insert(model, params, memory, context, features, valid_S)
 
 
-def colours(model: ModelConfig, features_VF: Array) -> np.ndarray:
-    """Return (V, 3) colours in [−1, 1] in which the memory's points are drawn."""
-    values = np.asarray(features_VF)
-    if not model.memory.KEEPS_FEATURES or not len(values):
-        return values[..., :3]
-    return model.memory.encoder.colours(values)
+def edited(model: AssembledModel, state: WorldState, changed: Memory) -> WorldState:
+    """Return a state with an edited memory, whose present frame shows the edit.
+
+    The next clip is conditioned on the present frame, which would otherwise still show what was
+    erased. Where the renderings of the memory before and after differ, pixels are taken from the
+    later one; its holes are filled with the nearest pixels. The frame is unchanged if the memory is
+    not rendered in colours.
+
+    Args:
+        model: the model.
+        state: the world before the edit.
+        changed: its edited memory.
+    """
+    frame = state.frame
+    if not shows_colours(model):
+        return WorldState(frame, changed)
+    size = (model.clip.height, model.clip.width)
+    before, after = (render(model, m, frame.camera, *size) for m in (state.map, changed))
+    apart = jnp.abs(before.features_THWF - after.features_THWF).max(-1) > 1e-3
+    apart = apart | (before.seen_THW != after.seen_THW)
+    apart = apart | (jnp.abs(before.depth_THW - after.depth_THW) > 1e-3)
+    whole = rendering.fill_nearest(after)
+    rgb = jnp.where(apart[..., None], whole.features_THWF[..., :3], frame.rgb_THWC)
+    depth = jnp.where(apart, whole.depth_THW, frame.depth_THW)
+    return WorldState(Frames(rgb, depth, frame.camera), changed)

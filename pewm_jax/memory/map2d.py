@@ -10,7 +10,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.config import AssembledModel, Memory
 from pewm_jax.memory import voxel_map
 from pewm_jax.types import Array, Camera, Frames, MapTokens, Params, VoxelMap
 
@@ -25,7 +25,7 @@ class Map2DConfig(Memory):
         (x, y, z), (nx, ny, nz) = self.cell_m, self.cells
         return dataclasses.replace(self, cell_m=(x, y, z * nz), cells=(nx, ny, 1))
 
-    def empty(self, model: ModelConfig, centre_3: Array) -> VoxelMap:
+    def empty(self, model: AssembledModel, centre_3: Array) -> VoxelMap:
         """Return an empty 2D map.
 
         The single layer is centred exactly on the given height. If it were snapped to multiples of
@@ -38,7 +38,7 @@ class Map2DConfig(Memory):
 
     def insert(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         memory: VoxelMap,
         frames: Frames,
@@ -51,12 +51,12 @@ class Map2DConfig(Memory):
         del model, params, observed
         return voxel_map.insert_frames(self.grid, memory, frames, features_ThwF, valid_T)
 
-    def read(self, model: ModelConfig, memory: VoxelMap, camera: Camera) -> MapTokens:
+    def read(self, model: AssembledModel, memory: VoxelMap, camera: Camera) -> MapTokens:
         """Choose the cells that condition one clip; see ``voxel_map.tokens``."""
         size = (model.clip.height, model.clip.width)
         return voxel_map.tokens(self.grid, memory, camera, size)
 
-    def to_points(self, model: ModelConfig, memory: VoxelMap) -> tuple[Array, Array, Array]:
+    def to_points(self, model: AssembledModel, memory: VoxelMap) -> tuple[Array, Array, Array]:
         """Return centre, features and validity of all slots."""
         del model
         return voxel_map.to_points(self.grid, memory)

@@ -12,7 +12,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.config import AssembledModel, Memory
 from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 
 
@@ -29,14 +29,14 @@ class NoMemoryConfig(Memory):
     KEEPS_FEATURES: ClassVar[bool] = False
     REMEMBERS: ClassVar[bool] = False
 
-    def empty(self, model: ModelConfig, centre_3: Array) -> Nothing:
+    def empty(self, model: AssembledModel, centre_3: Array) -> Nothing:
         """Return the empty memory."""
         del model, centre_3
         return Nothing()
 
     def insert(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         memory: Nothing,
         frames: Frames,
@@ -49,12 +49,12 @@ class NoMemoryConfig(Memory):
         del model, params, frames, features_ThwF, valid_T, observed
         return memory
 
-    def read(self, model: ModelConfig, memory: Nothing, camera: Camera) -> MapTokens:
+    def read(self, model: AssembledModel, memory: Nothing, camera: Camera) -> MapTokens:
         """Return masked tokens."""
         del model, memory, camera
         return self._masked(self.tokens)
 
-    def to_points(self, model: ModelConfig, memory: Nothing) -> tuple[Array, Array, Array]:
+    def to_points(self, model: AssembledModel, memory: Nothing) -> tuple[Array, Array, Array]:
         """Return one invalid slot."""
         del model, memory
         blank = self._masked(1)

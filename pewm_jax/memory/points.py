@@ -14,7 +14,7 @@ from typing import ClassVar
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.config import AssembledModel, Memory
 from pewm_jax.memory import cells
 from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 
@@ -95,7 +95,7 @@ class PointsConfig(Memory):
 
     KEEPS_FEATURES: ClassVar[bool] = False
 
-    def empty(self, model: ModelConfig, centre_3: Array) -> PointCloud:
+    def empty(self, model: AssembledModel, centre_3: Array) -> PointCloud:
         """Return a cloud without points, its grid centred on a world position."""
         del model
         zero = jnp.zeros((), jnp.int32)
@@ -110,7 +110,7 @@ class PointsConfig(Memory):
 
     def insert(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         memory: PointCloud,
         frames: Frames,
@@ -125,7 +125,7 @@ class PointsConfig(Memory):
         points, rgb, valid = cells.sample(frames, rows, columns, valid_T)
         return insert(self, memory, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
 
-    def to_points(self, model: ModelConfig, memory: PointCloud) -> tuple[Array, Array, Array]:
+    def to_points(self, model: AssembledModel, memory: PointCloud) -> tuple[Array, Array, Array]:
         """Return all slots as ``(points_world_V3, features_VF, valid_V)``.
 
         Features are the colour and a 1, then zeros up to the encoder's number of channels; free
@@ -145,7 +145,7 @@ class PointsConfig(Memory):
         padding = jnp.zeros((valid.shape[0], channels - CHANNELS))
         return points, jnp.concatenate([mean[:, 3:], mark, padding], -1), valid
 
-    def read(self, model: ModelConfig, memory: PointCloud, camera: Camera) -> MapTokens:
+    def read(self, model: AssembledModel, memory: PointCloud, camera: Camera) -> MapTokens:
         """Choose the points that condition one clip; see ``cells.choose``."""
         points, features, valid = self.to_points(model, memory)
         size = (model.clip.height, model.clip.width)

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Memory, ModelConfig
+from pewm_jax.config import AssembledModel, Memory
 from pewm_jax.errors import require, require_positive
 from pewm_jax.geometry.cameras import matmul, transform_points, unproject
 from pewm_jax.geometry.depth_images import normals
@@ -322,7 +322,7 @@ class SurfelConfig(Memory):
             "an encoder with more, or set memory.features.",
         )
 
-    def empty(self, model: ModelConfig, centre_3: Array) -> Surfels:
+    def empty(self, model: AssembledModel, centre_3: Array) -> Surfels:
         """Return a memory of no surfels, its grid centred on a world position."""
         del model
         count, zero = self.capacity, jnp.zeros((), jnp.int32)
@@ -340,7 +340,7 @@ class SurfelConfig(Memory):
 
     def insert(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         memory: Surfels,
         frames: Frames,
@@ -388,7 +388,7 @@ class SurfelConfig(Memory):
         )
         return insert(self, memory, new, observed)
 
-    def to_points(self, model: ModelConfig, memory: Surfels) -> tuple[Array, Array, Array]:
+    def to_points(self, model: AssembledModel, memory: Surfels) -> tuple[Array, Array, Array]:
         """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0.
 
         Without ``features`` these are the colour, a 1 that marks a surfel, and zeros up to the
@@ -402,7 +402,7 @@ class SurfelConfig(Memory):
         padding = jnp.zeros((valid.shape[0], self.encoder.channels - 4))
         return points, jnp.concatenate([colours, there, padding], -1), valid
 
-    def read(self, model: ModelConfig, memory: Surfels, camera: Camera) -> MapTokens:
+    def read(self, model: AssembledModel, memory: Surfels, camera: Camera) -> MapTokens:
         """Choose the surfels that condition one clip; see ``cells.choose``."""
         points, features, valid = self.to_points(model, memory)
         size = (model.clip.height, model.clip.width)
@@ -410,7 +410,7 @@ class SurfelConfig(Memory):
         return MapTokens(features[order], points[order], valid[order])
 
     def render(
-        self, model: ModelConfig, memory: Surfels, camera: Camera, height: int, width: int
+        self, model: AssembledModel, memory: Surfels, camera: Camera, height: int, width: int
     ) -> rendering.View:
         """Render the features if they are kept, else the 3 colours; see ``Memory.render``."""
         del model
@@ -435,7 +435,7 @@ class SurfelConfig(Memory):
         names = ("cell_V", "sums_VC", "size_V", "observed_V")
         return dataclasses.replace(memory, **{name: getattr(memory, name)[:left] for name in names})
 
-    def erase(self, model: ModelConfig, memory: Surfels, box_23: Array) -> Surfels:
+    def erase(self, model: AssembledModel, memory: Surfels, box_23: Array) -> Surfels:
         """Erase a box; see ``Memory.erase``."""
         del model
         points, *_, valid = means(self, memory)
@@ -443,7 +443,7 @@ class SurfelConfig(Memory):
 
     def move(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         memory: Surfels,
         box_23: Array,
         transform: Array,

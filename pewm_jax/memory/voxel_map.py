@@ -36,7 +36,7 @@ import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
-from pewm_jax.config import Memory, ModelConfig, UserError
+from pewm_jax.config import AssembledModel, Memory, UserError
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import cells, voxel_files, voxel_frames
 from pewm_jax.memory.voxel_files import load, save
@@ -406,14 +406,14 @@ class VoxelConfig(Memory):
 
     EDITABLE: ClassVar[bool] = True
 
-    def empty(self, model: ModelConfig, centre_3: Array) -> VoxelMap:
+    def empty(self, model: AssembledModel, centre_3: Array) -> VoxelMap:
         """Return an empty map with a grid centred on a world position."""
         del model
         return empty(self, centre_3, self.encoder.channels)
 
     def insert(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         memory: VoxelMap,
         frames: Frames,
@@ -426,23 +426,23 @@ class VoxelConfig(Memory):
         del model, params, observed
         return insert_frames(self, memory, frames, features_ThwF, valid_T)
 
-    def read(self, model: ModelConfig, memory: VoxelMap, camera: Camera) -> MapTokens:
+    def read(self, model: AssembledModel, memory: VoxelMap, camera: Camera) -> MapTokens:
         """Choose the cells that condition one clip; see ``tokens``."""
         return tokens(self, memory, camera, (model.clip.height, model.clip.width))
 
-    def to_points(self, model: ModelConfig, memory: VoxelMap) -> tuple[Array, Array, Array]:
+    def to_points(self, model: AssembledModel, memory: VoxelMap) -> tuple[Array, Array, Array]:
         """Return centre, features and validity of all slots."""
         del model
         return to_points(self, memory)
 
-    def erase(self, model: ModelConfig, memory: VoxelMap, box_23: Array) -> VoxelMap:
+    def erase(self, model: AssembledModel, memory: VoxelMap, box_23: Array) -> VoxelMap:
         """Forget a box; see ``erase``."""
         del model
         return erase(self, memory, box_23)
 
     def move(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         memory: VoxelMap,
         box_23: Array,
         transform: Array,

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.types import Array, Params
 
@@ -79,7 +79,7 @@ NO_READERS = Readers()
 """No memory is read."""
 
 
-def observed(model: ModelConfig, params: Params, seen: Observed) -> Conditioning:
+def observed(model: AssembledModel, params: Params, seen: Observed) -> Conditioning:
     """Turn the observed frames into inputs of the backbone, by its own ways if it has any.
 
     By default the latents are joined to the input, zero for the frames to be imagined.

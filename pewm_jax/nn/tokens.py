@@ -20,7 +20,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.nn import placement
 from pewm_jax.types import Array
 
@@ -67,7 +67,7 @@ def patchify_images(images_BHWC: Array, patch: int) -> Array:
     return grid.transpose(0, 1, 3, 2, 4, 5).reshape(batch, -1, patch * patch * channels)
 
 
-def video_tokens(model: ModelConfig) -> tuple[int, int]:
+def video_tokens(model: AssembledModel) -> tuple[int, int]:
     """Return the video tokens of a clip: (tokens in time, tokens at each time).
 
     If a backbone names no places, its tokens are the latent cells.
@@ -78,7 +78,7 @@ def video_tokens(model: ModelConfig) -> tuple[int, int]:
     return -(-t // places.patch_t), (h // places.patch) * (w // places.patch)
 
 
-def text_tokens(model: ModelConfig) -> int:
+def text_tokens(model: AssembledModel) -> int:
     """Return the number of text tokens of a clip."""
     return model.backbone.text_shape[0] if model.backbone.text_shape else 0
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import Encoder, ModelConfig, UserError
+from pewm_jax.config import AssembledModel, Encoder, UserError
 from pewm_jax.errors import require
 from pewm_jax.geometry.actions import heading
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -173,7 +173,7 @@ class Features(PictureCost):
         params: the encoder's parameters, or the world model's.
     """
 
-    settings: Encoder | ModelConfig
+    settings: Encoder | AssembledModel
     params: Params = dataclasses.field(repr=False)
 
     def pictures(self, frames: Frames, goal: Frames) -> Array:
@@ -186,7 +186,7 @@ class Features(PictureCost):
 
 @functools.partial(jax.jit, static_argnums=0)
 def _features(
-    settings: Encoder | ModelConfig, params: Params, rgb_PHWC: Array, goal_1HWC: Array
+    settings: Encoder | AssembledModel, params: Params, rgb_PHWC: Array, goal_1HWC: Array
 ) -> Array:
     def encoded(picture_HWC: Array) -> Array:
         if isinstance(settings, Encoder):

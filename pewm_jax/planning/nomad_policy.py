@@ -21,10 +21,10 @@ import numpy as np
 
 from pewm_jax.codecs.signals import signal_from_rgb
 from pewm_jax.config import ActionConfig, UserError
-from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.diffusion import squared_cosine
 from pewm_jax.geometry.actions import discrete_table
 from pewm_jax.models.nomad import model as nomad
+from pewm_jax.models.nomad.config import NomadConfig
 from pewm_jax.types import Array, Params
 
 STILL_M = 0.02

@@ -22,7 +22,6 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.codecs.signals import rgb_from_signal
 from pewm_jax.config import ActionConfig, Config, UserError
-from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.data.simulator import Simulator, move
 from pewm_jax.data.trajectories import advance
 from pewm_jax.errors import require
@@ -34,6 +33,7 @@ from pewm_jax.geometry.actions import (
     discrete_table,
     heading,
 )
+from pewm_jax.models.nomad.config import NomadConfig
 from pewm_jax.planning import nomad_policy
 from pewm_jax.types import Frames, Params
 

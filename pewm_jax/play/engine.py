@@ -101,8 +101,7 @@ class Engine:
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), np.zeros(0, bool)
         points, features, valid, observed = _points(self.model, world)
         points, features, valid = (np.asarray(x) for x in (points, features, valid))
-        colours = worlds.function(self.model, "point_colours")(self.model, features[valid])
-        colours = np.asarray(colours)
+        colours = np.asarray(self.model.point_colours(features[valid]))
         shown = ((np.clip(colours, -1, 1) + 1) * 127.5).round().astype(np.uint8)
         seen = np.ones(len(shown), bool) if observed is None else np.asarray(observed)[valid]
         return points[valid], shown, seen

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.config.parts import Reader, Rules
 from pewm_jax.controls.camera import CameraConfig
 from pewm_jax.errors import require, require_positive
@@ -48,23 +48,23 @@ SINUSOID = 60
 """Channels of a position encoded as a sinusoid."""
 
 
-def token_channels(model: ModelConfig) -> int:
+def token_channels(model: AssembledModel) -> int:
     """Return the channels of a map token: its features and, if sinusoidal, its position."""
     positions = SINUSOID if _settings(model).positions == "sinusoid" else 0
     return model.memory.encoder.channels + positions
 
 
-def _settings(model: ModelConfig) -> AttentionConfig:
+def _settings(model: AssembledModel) -> AttentionConfig:
     return model.memory.reader  # type: ignore[return-value]
 
 
-def _ray_channels(model: ModelConfig) -> int:
+def _ray_channels(model: AssembledModel) -> int:
     """Return the channels of the rays of one video token."""
     places = model.backbone.places
     return CameraConfig().channels(model) * places.patch**2 * places.patch_t
 
 
-def _embeddings(model: ModelConfig) -> tuple[modules.nn.Dense, modules.nn.Dense]:
+def _embeddings(model: AssembledModel) -> tuple[modules.nn.Dense, modules.nn.Dense]:
     """Return the linear layers that embed rays (one vector per video token) and map tokens."""
     dtype = jnp.dtype(model.dtype)
     camera = modules.dense(model.backbone.places.width // 2, dtype, "camera")
@@ -76,7 +76,7 @@ def _embeddings(model: ModelConfig) -> tuple[modules.nn.Dense, modules.nn.Dense]
     return camera, tokens
 
 
-def _block(model: ModelConfig, layout: TokenLayout) -> MemoryBlock:
+def _block(model: AssembledModel, layout: TokenLayout) -> MemoryBlock:
     grid = max(model.clip.height, model.clip.width) // patch_pixels(model)
     return MemoryBlock(_settings(model), grid, layout, always=not model.memory.REMEMBERS)
 
@@ -121,7 +121,7 @@ class AttentionConfig(Reader):
             f"at least {cameras} heads, or memory.reader.positions sinusoid.",
         )
 
-    def init(self, model: ModelConfig, key: Array) -> Params:
+    def init(self, model: AssembledModel, key: Array) -> Params:
         """Return random parameters; the blocks' gates are zero."""
         places = model.backbone.places
         camera, tokens = _embeddings(model)
@@ -158,7 +158,7 @@ class AttentionConfig(Reader):
 
     def prepare(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         readout: MemoryReadout,
         camera: Camera,

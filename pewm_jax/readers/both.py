@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import jax
 
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.config.parts import Rules
 from pewm_jax.models.interface import Readers
 from pewm_jax.readers.attention import AttentionConfig
@@ -28,14 +28,14 @@ class BothConfig(AttentionConfig, RenderConfig):
     READS_TOKENS: ClassVar[bool] = True
     READS_VIEW: ClassVar[bool] = True
 
-    def init(self, model: ModelConfig, key: Array) -> Params:
+    def init(self, model: AssembledModel, key: Array) -> Params:
         """Return random parameters of both; the attention's are those that it has alone."""
         rendering = RenderConfig.init(self, model, jax.random.fold_in(key, 1))
         return {**AttentionConfig.init(self, model, key), **rendering}
 
     def prepare(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         readout: MemoryReadout,
         camera: Camera,

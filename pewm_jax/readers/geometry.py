@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.geometry import zbuffer
 from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
 from pewm_jax.geometry.plucker import fold_frames
@@ -97,13 +97,13 @@ def hidden(uv_TM2: Array, z_TM: Array, visible_TM: Array, size: np.ndarray, bin_
     return visible_TM & (z_TM > BEHIND * nearest)
 
 
-def patch_pixels(model: ModelConfig) -> int:
+def patch_pixels(model: AssembledModel) -> int:
     """Return the side of a video token in pixels."""
     return model.codec.spatial * model.backbone.places.patch
 
 
 def sightings(
-    model: ModelConfig, config: Any, camera: Camera, points_M3: Array, valid_M: Array
+    model: AssembledModel, config: Any, camera: Camera, points_M3: Array, valid_M: Array
 ) -> Sightings:
     """Choose the map tokens that each camera attends to, and compute their positions.
 
@@ -132,7 +132,7 @@ def sightings(
 
 
 def _look(
-    model: ModelConfig, config: Any, camera: Camera, points_M3: Array, valid_M: Array
+    model: AssembledModel, config: Any, camera: Camera, points_M3: Array, valid_M: Array
 ) -> tuple[Array, ...]:
     """Return the first four fields of ``Sightings``."""
     clip, patch, patch_t = model.clip, patch_pixels(model), model.backbone.places.patch_t
@@ -162,14 +162,14 @@ def _look(
     return fold(index), _angles(fold(uv) / patch, head_dim, grid), fold(place), fold(visible)
 
 
-def _turns(model: ModelConfig, points_M3: Array, valid_M: Array, camera: Camera) -> Array:
+def _turns(model: AssembledModel, points_M3: Array, valid_M: Array, camera: Camera) -> Array:
     """Return (T, M) how early each camera names each token; see ``zbuffer.visibility_rank``."""
     cell_m, size = model.memory.cell_m, (model.clip.height, model.clip.width)
     wide, tall = jnp.float32(max(cell_m[:2])), jnp.float32(cell_m[2])
     return zbuffer.visibility_rank(points_M3, wide, tall, valid_M, camera, size)
 
 
-def sinusoid_3d(model: ModelConfig, config: Any, camera: Camera, points_M3: Array) -> Array:
+def sinusoid_3d(model: AssembledModel, config: Any, camera: Camera, points_M3: Array) -> Array:
     """Return (B, M, 6·10) sines and cosines of the positions of map tokens.
 
     The 10 wavelengths grow geometrically from 4 × a cell's smallest side to 4 × the map's largest

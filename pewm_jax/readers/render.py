@@ -25,7 +25,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs.pixel import fold
 from pewm_jax.codecs.signals import signal_from_depth
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.config.parts import Reader, Rules
 from pewm_jax.errors import require, require_positive
 from pewm_jax.models.interface import Readers
@@ -77,21 +77,21 @@ _RULES = (
 )
 
 
-def _settings(model: ModelConfig) -> RenderConfig:
+def _settings(model: AssembledModel) -> RenderConfig:
     return model.memory.reader  # type: ignore[return-value]
 
 
-def _reduces(model: ModelConfig) -> bool:
+def _reduces(model: AssembledModel) -> bool:
     config = _settings(model)
     return not config.READS_LATENTS and model.memory.rendered_channels > config.reduced
 
 
-def pixel_channels(model: ModelConfig) -> int:
+def pixel_channels(model: AssembledModel) -> int:
     """Return the channels of a pixel of the pictures: features, depth and mask."""
     return min(model.memory.rendered_channels, _settings(model).reduced) + 2
 
 
-def cell_channels(model: ModelConfig) -> int:
+def cell_channels(model: AssembledModel) -> int:
     """Return the channels of what is read at a cell of the latents; see ``cells``."""
     codec = model.codec
     pixels = codec.temporal * codec.spatial**2
@@ -99,13 +99,13 @@ def cell_channels(model: ModelConfig) -> int:
     return codec.channels + pixels if latents else pixel_channels(model) * pixels
 
 
-def token_channels(model: ModelConfig) -> int:
+def token_channels(model: AssembledModel) -> int:
     """Return the channels of the part of the pictures that one video token stands for."""
     places = model.backbone.places
     return cell_channels(model) * places.patch_t * places.patch**2
 
 
-def _embeddings(model: ModelConfig) -> dict[str, modules.nn.Dense]:
+def _embeddings(model: AssembledModel) -> dict[str, modules.nn.Dense]:
     """Return the linear layers on the way from pictures to tokens, by name."""
     config, dtype = _settings(model), jnp.dtype(model.dtype)
     found = {"embed_1": config.picture_width, "embed_2": config.picture_width}
@@ -116,7 +116,7 @@ def _embeddings(model: ModelConfig) -> dict[str, modules.nn.Dense]:
     return made
 
 
-def pictures(model: ModelConfig, params: Params, view: View) -> Array:
+def pictures(model: AssembledModel, params: Params, view: View) -> Array:
     """Return (B, T, H, W, C) what is read of pictures: features where seen, depth, the mask.
 
     Depth is also read where only the back of something is known, a wall of the room next door.
@@ -135,7 +135,7 @@ def pictures(model: ModelConfig, params: Params, view: View) -> Array:
     return jnp.concatenate([x.astype(dtype) for x in (features, depth, seen)], -1)
 
 
-def cells(model: ModelConfig, params: Params, readout: MemoryReadout) -> tuple[Array, Array]:
+def cells(model: AssembledModel, params: Params, readout: MemoryReadout) -> tuple[Array, Array]:
     """Return what is read at each cell of the latents, and which clips see anything.
 
     Args:
@@ -160,7 +160,7 @@ def cells(model: ModelConfig, params: Params, readout: MemoryReadout) -> tuple[A
     return joined, encoded.seen_THW.any((1, 2, 3))
 
 
-def _apply(model: ModelConfig, params: Params, name: str, x: Array) -> Array:
+def _apply(model: AssembledModel, params: Params, name: str, x: Array) -> Array:
     """Apply one of the layers on the way from pictures to tokens."""
     return _embeddings(model)[name].apply({"params": params[name]}, x)
 
@@ -206,7 +206,7 @@ class RenderConfig(Reader):
             "shows features: use memory.kind surfels or points, or memory.reader.picture pixels.",
         )
 
-    def init(self, model: ModelConfig, key: Array) -> Params:
+    def init(self, model: AssembledModel, key: Array) -> Params:
         """Return random parameters, under ``render``; gates and ``added`` are zero."""
         places = model.backbone.places
         widths = {
@@ -233,7 +233,7 @@ class RenderConfig(Reader):
 
     def prepare(
         self,
-        model: ModelConfig,
+        model: AssembledModel,
         params: Params,
         readout: MemoryReadout,
         camera: Camera,

@@ -29,11 +29,11 @@ import numpy as np
 
 from pewm_jax import config as configuration
 from pewm_jax import worlds
-from pewm_jax.config import ActionConfig, Config, NomadWorldConfig, UserError
-from pewm_jax.config.nomad import NomadConfig
+from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.eval.reproject import ReprojectSettings, reproject
 from pewm_jax.geometry.actions import continuous, integrate
 from pewm_jax.io.store import file_hash
+from pewm_jax.models.nomad.config import NomadConfig
 from pewm_jax.planning import nomad_policy
 from pewm_jax.planning.candidates import CandidateCost, ImaginedRollout, Rollout, rank_by
 from pewm_jax.planning.costs import FrameCost
@@ -42,6 +42,7 @@ from pewm_jax.planning.settings import CEM, PlanConfig
 from pewm_jax.studies.goals import Goal, TaskInput, wander
 from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.types import Camera, Frames, Params
+from pewm_jax.worlds.nomad import NomadTask
 from pewm_jax.worlds.rollouts import load_finished
 
 PREDICTORS = ("empty", "reproject", "memory", "truth")
@@ -358,7 +359,7 @@ def open_policy(name: str | Path) -> LoadedPolicy:
     if not is_run(folder):
         raise UserError(f"{folder} contains no run: train a policy first (pewm-jax train nomad).")
     config, params = load_finished(folder)
-    if not isinstance(config.model, NomadWorldConfig):
+    if not isinstance(config.model, NomadTask):
         raise UserError(f"{folder} contains no policy: give the run of one (pewm-jax train nomad).")
     return LoadedPolicy(
         folder, config, params["policy"], model_digest(file_hash(folder / WEIGHTS), config)

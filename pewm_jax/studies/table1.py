@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pewm_jax.config import Config, ModelConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.eval import intervals
 from pewm_jax.io import atomic
 from pewm_jax.studies import table1_numbers, table1_page, table1_rows, table1_training
@@ -30,7 +30,7 @@ from pewm_jax.studies.table1_scoring import (
     write_recorded,
 )
 from pewm_jax.studies.table1_training import Study, backbone_of, planned, settings, train
-from pewm_jax.worlds.pewm.world import STAGES
+from pewm_jax.worlds.pewm.world import PEWM, STAGES
 
 RESULTS, HOURS = "results.json", "hours.json"
 SCHEMA = 2
@@ -112,7 +112,7 @@ def run(
 def _rows(
     base: Config, only: Sequence[str], ablation: str, values: tuple[str, ...]
 ) -> tuple[Row, ...]:
-    if type(base.model) is not ModelConfig:
+    if type(base.model) is not PEWM:
         raise UserError(
             f"the settings are of a {type(base.model).__name__}, but Table 1 compares memories of "
             "the world pewm: use a preset of that, such as table1."

@@ -28,7 +28,7 @@ import jax
 
 from pewm_jax import config as configuration
 from pewm_jax import shipped
-from pewm_jax.config import Config, ModelConfig, StageConfig, UserError
+from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.errors import require
@@ -40,7 +40,7 @@ from pewm_jax.studies.table1_rows import Row
 from pewm_jax.train import loop, sharding
 from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.train.step import compile_step, initial_state, noise_key
-from pewm_jax.worlds.pewm.world import STAGES
+from pewm_jax.worlds.pewm.world import PEWM, STAGES
 
 CODEC, MADE_FROM = "codec", "made_from.json"
 Log = Callable[[str], Any]
@@ -287,7 +287,7 @@ def _read_times(path: Path) -> Times:
 def _model(study: Study, row: Row) -> str:
     """Return a hash of all that the step time of a row depends on."""
     config = settings(study, row, 0, 1, start=UNREAD)
-    assert isinstance(config.model, ModelConfig)
+    assert isinstance(config.model, PEWM)
     facts = [configuration.to_dict(config.model), STAGES[0].settings(config).batch, row.reads]
     return inputs_hash(facts)[:16]
 

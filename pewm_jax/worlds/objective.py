@@ -23,7 +23,7 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_rgb
-from pewm_jax.config import ModelConfig, TrainSettings, UserError
+from pewm_jax.config import AssembledModel, TrainSettings, UserError
 from pewm_jax.config.parts import Noise
 from pewm_jax.memory import interface as memories
 from pewm_jax.nn import placement
@@ -38,7 +38,7 @@ FINE = 0.3
 
 
 def clip_readout(
-    model: ModelConfig, params: Params, clip: Clip, *, pictures: bool = False
+    model: AssembledModel, params: Params, clip: Clip, *, pictures: bool = False
 ) -> MemoryReadout:
     """Build every clip's memory from its context and return what it shows, leading axis B.
 
@@ -68,7 +68,7 @@ def clip_readout(
     return placement.by_batch(of_batch, weights, clip)
 
 
-def _features(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
+def _features(model: AssembledModel, weights: Params, rgb_BSHWC: Array) -> Array:
     """Return the features of every clip's context; encoders with weights run clip by clip."""
 
     def of_clip(rgb_SHWC: Array) -> Array:
@@ -78,7 +78,7 @@ def _features(model: ModelConfig, weights: Params, rgb_BSHWC: Array) -> Array:
     return jax.lax.map(of_clip, rgb_BSHWC) if large else jax.vmap(of_clip)(rgb_BSHWC)
 
 
-def prepare(model: ModelConfig, params: Params, clip: Clip, *, memory: bool) -> Clip:
+def prepare(model: AssembledModel, params: Params, clip: Clip, *, memory: bool) -> Clip:
     """Encode a batch's frames and look at its memories; the context is not kept.
 
     Args:
@@ -104,7 +104,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip, *, memory: bool) -> 
 
 
 def loss(
-    model: ModelConfig,
+    model: AssembledModel,
     train: TrainSettings,
     params: Params,
     clip: Clip,
@@ -230,7 +230,7 @@ with_memory = functools.partial(loss, memory=True)
 
 
 def first_frames(
-    model: ModelConfig,
+    model: AssembledModel,
     share: float,
     params: Params,
     frames: Frames,
@@ -292,7 +292,7 @@ def first_frames(
     return replaced(made[0], true[0]), replaced(made[1], true[1])
 
 
-def backwards(model: ModelConfig, readout: MemoryReadout) -> MemoryReadout:
+def backwards(model: AssembledModel, readout: MemoryReadout) -> MemoryReadout:
     """Return what the memory shows clips that are run backwards; leading axes B and T.
 
     Tokens have no order in time. All else is reversed along T; latents that stand for one frame
@@ -318,7 +318,7 @@ def backwards(model: ModelConfig, readout: MemoryReadout) -> MemoryReadout:
 
 
 def _looking_back(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     frames: Frames,
     latents_BthwC: Array,

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs import rgbd
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.controls import camera as camera_control
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.interface import NO_READERS, Conditioning, Observed
@@ -43,7 +43,7 @@ class ClipConditioning:
 
 
 def condition(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     observed: Frames,
     control: Control,
@@ -82,7 +82,7 @@ def condition(
 
 
 def blind(
-    model: ModelConfig, params: Params, conditioning: ClipConditioning, hidden_B: Array
+    model: AssembledModel, params: Params, conditioning: ClipConditioning, hidden_B: Array
 ) -> ClipConditioning:
     """Hide from clips of a batch what guidance is on, in a world without a memory.
 
@@ -109,7 +109,7 @@ def blind(
 
 
 def without_image(
-    model: ModelConfig, conditioning: ClipConditioning, hidden_B: Array
+    model: AssembledModel, conditioning: ClipConditioning, hidden_B: Array
 ) -> ClipConditioning:
     """Hide the observed image from clips of a batch; control, text and scalars stay.
 
@@ -135,7 +135,7 @@ def without_image(
     return dataclasses.replace(conditioning, backbone=hidden)
 
 
-def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) -> Array | None:
+def _text(model: AssembledModel, params: Params, batch: int, more: Array | None) -> Array | None:
     """Return the prompt's tokens (zeros without a prompt), followed by the control's."""
     shape = model.backbone.text_shape
     if shape is None:
@@ -146,7 +146,7 @@ def _text(model: ModelConfig, params: Params, batch: int, more: Array | None) ->
     return text if more is None else jnp.concatenate([text, more], 1)
 
 
-def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
+def init(model: AssembledModel, key: Array, *, memory: bool = True) -> Params:
     """Return random parameters; with ``memory`` also the reader's, without effect at first.
 
     A backbone that names no places has no reader.
@@ -171,7 +171,7 @@ def init(model: ModelConfig, key: Array, *, memory: bool = True) -> Params:
 
 
 def apply(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     noisy_BthwC: Array,
     conditioning: ClipConditioning,
@@ -203,7 +203,7 @@ def apply(
     return _seen(model, out.astype(jnp.float32))
 
 
-def _seen(model: ModelConfig, latents_C: Array) -> Array:
+def _seen(model: AssembledModel, latents_C: Array) -> Array:
     """Set the depth channels of latents to zero if the denoiser works without depth.
 
     The channels remain, so that both variants have the same parameters.
@@ -215,7 +215,7 @@ def _seen(model: ModelConfig, latents_C: Array) -> Array:
 
 
 def draw(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     conditioning: ClipConditioning,
     readout: MemoryReadout | None,
@@ -230,7 +230,7 @@ def draw(
 
 
 def sample(
-    model: ModelConfig,
+    model: AssembledModel,
     params: Params,
     conditioning: ClipConditioning,
     readout: MemoryReadout | None,

@@ -10,9 +10,10 @@ import pytest
 from pewm_jax.codecs import learned as learned_codec
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import ClipConfig, Codec, CodecWorldConfig, ConfigError, UserError, from_dict
+from pewm_jax.config import ClipConfig, Codec, ConfigError, UserError, from_dict
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.worlds import objective
+from pewm_jax.worlds.codec import CodecTask
 from tests.helpers import init_world, random_frames, randomise, tiny_model
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
@@ -85,7 +86,7 @@ def test_settings_that_cannot_work_are_refused_in_a_sentence():
     with pytest.raises(ConfigError, match=r"multiples of codec\.spatial × backbone\.patch = 16"):
         tiny_model(codec=TINY, clip=ClipConfig(height=24, width=24))
     with pytest.raises(ConfigError, match=r"multiples of codec\.spatial = 8"):
-        CodecWorldConfig(codec=TINY, clip=ClipConfig(height=20, width=24))
+        CodecTask(codec=TINY, clip=ClipConfig(height=20, width=24))
 
 
 def test_the_default_has_at_most_three_million_parameters_as_its_layout_says():

@@ -23,7 +23,6 @@ from pewm_jax.config import (
     ConfigError,
     DataConfig,
     EvalConfig,
-    ModelConfig,
     Settings,
     StageConfig,
     TrainConfig,
@@ -42,6 +41,7 @@ from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.worlds.pewm.world import PEWM
 from tests.properties import examples
 
 VERSION_1 = Path(__file__).parent / "version_1"
@@ -57,15 +57,15 @@ def test_every_preset_goes_to_json_and_back(name, tmp_path):
 
 
 def model_of(memory, codec=None):
-    return ModelConfig(memory=memory, codec=codec or PixelConfig())
+    return PEWM(memory=memory, codec=codec or PixelConfig())
 
 
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
         (lambda: ClipConfig(frames=1), "use 9"),
-        (lambda: ModelConfig(clip=ClipConfig(frames=8)), r"use 4k \+ 1 frames \(5, 9, …\)"),
-        (lambda: ModelConfig(ClipConfig(frames=13), codec=VAECodec()), r"8k \+ 1"),
+        (lambda: PEWM(clip=ClipConfig(frames=8)), r"use 4k \+ 1 frames \(5, 9, …\)"),
+        (lambda: PEWM(ClipConfig(frames=13), codec=VAECodec()), r"8k \+ 1"),
         (lambda: ClipConfig(near_m=5, far_m=2), "below far"),
         (lambda: ClipConfig(height=0), "at least 12 pixels"),
         (lambda: ClipConfig(width=11), "window of 11"),
@@ -100,7 +100,7 @@ def model_of(memory, codec=None):
         (lambda: TrainConfig(clip_norm=0), "above 0"),
         (lambda: EvalConfig(seeds=()), "at least one seed"),
         (lambda: EvalConfig(seeds=(0, -1)), "0 or positive"),
-        (lambda: ModelConfig(clip=ClipConfig(height=20)), "multiples of"),
+        (lambda: PEWM(clip=ClipConfig(height=20)), "multiples of"),
         (lambda: model_of(ImagesConfig(snapshots=9, tokens=8)), "raise tokens or lower snapshots"),
         (lambda: model_of(VoxelConfig(encoder=PatchColoursConfig(patch=5))), "does not divide"),
         (lambda: DINOv2EncoderConfig(size=500), "use a multiple of memory.encoder.network.patch"),
@@ -140,11 +140,11 @@ def test_sizes_below_one_are_refused_by_name(kind, name, value):
 
 def test_what_the_checks_must_not_refuse():
     model_of(VoxelConfig(reader=AttentionConfig(heads=2, positions="sinusoid")))
-    Config(model=ModelConfig(clip=ClipConfig(height=16, width=16)))
+    Config(model=PEWM(clip=ClipConfig(height=16, width=16)))
     Config(train=TrainConfig(stage2=StageConfig(steps=0)))
     model_of(VoxelConfig(reader=AttentionConfig(heads=1)), PixelConfig(temporal=1))
     seven = VoxelConfig(reader=AttentionConfig(heads=7))
-    ModelConfig(clip=ClipConfig(frames=8), codec=PixelConfig(temporal=7), memory=seven)
+    PEWM(clip=ClipConfig(frames=8), codec=PixelConfig(temporal=7), memory=seven)
 
 
 @pytest.mark.parametrize(
@@ -284,7 +284,7 @@ def experiments(draw):
         encoder=encoder,
         reader=reader,
     )
-    model = ModelConfig(**{**parts, "noise": steps}, memory=memory)
+    model = PEWM(**{**parts, "noise": steps}, memory=memory)
     train = TrainConfig(
         ema=draw(st.floats(0, 0.999)), fresh=tuple(draw(st.lists(st.sampled_from("abc"))))
     )

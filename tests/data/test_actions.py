@@ -8,11 +8,12 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, UserError
+from pewm_jax.config import ClipConfig, Config, DataConfig, UserError
 from pewm_jax.data import clips, loader
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.episodes import read_episode, write_episode
 from pewm_jax.geometry.actions import compose, integrate
+from pewm_jax.worlds.pewm.world import PEWM
 from tests.data.two_rooms import arrays, split, write_split
 
 T = 5
@@ -27,7 +28,7 @@ def episode(**options):
 
 def config(path="", **data):
     return Config(
-        model=ModelConfig(clip=ClipConfig(frames=T, height=16, width=16)),
+        model=PEWM(clip=ClipConfig(frames=T, height=16, width=16)),
         data=DataConfig(path=str(path), **{"context": 3, **data}),
     )
 

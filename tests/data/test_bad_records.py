@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, UserError
+from pewm_jax.config import ClipConfig, Config, DataConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.dataset import (
     EpisodeSource,
@@ -20,6 +20,7 @@ from pewm_jax.data.dataset import (
 )
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.loader import BadRecords
+from pewm_jax.worlds.pewm.world import PEWM
 from tests.data.two_rooms import split
 
 SHARD = "shard-00000-of-00002.array_record"
@@ -27,7 +28,7 @@ SHARD = "shard-00000-of-00002.array_record"
 
 def config(root, **data):
     return Config(
-        model=ModelConfig(clip=ClipConfig(frames=5, height=16, width=16)),
+        model=PEWM(clip=ClipConfig(frames=5, height=16, width=16)),
         data=DataConfig(path=str(root), **{"stride_max": 3, "context": 6, **data}),
     )
 

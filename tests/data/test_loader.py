@@ -8,26 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pewm_jax.config import (
-    ActionConfig,
-    ClipConfig,
-    Config,
-    ConfigError,
-    DataConfig,
-    ModelConfig,
-    UserError,
-)
+from pewm_jax.config import ActionConfig, ClipConfig, Config, ConfigError, DataConfig, UserError
 from pewm_jax.data import clips as clipping
 from pewm_jax.data import loader
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.geometry.cameras import unproject
+from pewm_jax.worlds.pewm.world import PEWM
 from tests.data.two_rooms import split
 from tests.properties import examples
 
 
 def config(path="", **data):
     return Config(
-        model=ModelConfig(clip=ClipConfig(frames=5, height=16, width=16)),
+        model=PEWM(clip=ClipConfig(frames=5, height=16, width=16)),
         data=DataConfig(path=str(path), **{"stride_max": 3, "context": 6, **data}),
     )
 
@@ -187,9 +180,7 @@ def rows_config(tmp_path_factory):
     root = tmp_path_factory.mktemp("data")
     split(root / "train", episodes=4, frames=16)
     clip = ClipConfig(frames=5, height=16, width=16)
-    return Config(
-        model=ModelConfig(clip=clip), data=DataConfig(path=str(root), stride_max=3, context=3)
-    )
+    return Config(model=PEWM(clip=clip), data=DataConfig(path=str(root), stride_max=3, context=3))
 
 
 @given(st.integers(0, BATCH - 1), st.integers(1, BATCH), st.integers(0, 9))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pewm_jax.config import ConfigError, ModelConfig, NomadWorldConfig, PersistConfig
+from pewm_jax.config import ConfigError
 from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.loader import require_same_cells
@@ -17,6 +17,9 @@ from pewm_jax.geometry import block_light
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.types import Camera
+from pewm_jax.worlds.nomad import NomadTask
+from pewm_jax.worlds.persist.world import PERSIST
+from pewm_jax.worlds.pewm.world import PEWM
 
 NAMES = VoxelsConfig(kinds="groups", colours=2).names
 WHITE, BROWN = 1, 2
@@ -80,17 +83,17 @@ def test_an_episode_of_cells_shows_the_cells_it_records():
     # A world says which pictures and which classes it expects.
     cell = (0.25, 0.25, 0.25)
     blocks = GridConfig(cell_m=cell, kinds="groups", colours=16, pictures="cells")
-    expects = PersistConfig(memory=blocks)
-    of_surfaces = PersistConfig(memory=dataclasses.replace(blocks, pictures="surfaces"))
+    expects = PERSIST(memory=blocks)
+    of_surfaces = PERSIST(memory=dataclasses.replace(blocks, pictures="surfaces"))
     require_same_cells(expects, episode)
     require_same_cells(of_surfaces, house)
     with pytest.raises(ConfigError, match="has pictures of surfaces"):
         require_same_cells(expects, house)
-    fewer = PersistConfig(memory=dataclasses.replace(blocks, colours=8))
+    fewer = PERSIST(memory=dataclasses.replace(blocks, colours=8))
     with pytest.raises(ConfigError, match=r"--voxels\.kinds groups --voxels\.colours 16, and"):
         require_same_cells(fewer, episode)
     # Worlds without a grid, or without any memory, read every dataset.
-    for world in (ModelConfig(), NomadWorldConfig()):
+    for world in (PEWM(), NomadTask()):
         require_same_cells(world, episode)
 
 

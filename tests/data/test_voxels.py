@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pewm_jax.cli import main as program
-from pewm_jax.config import ArraySpec, BatchSpec, ConfigError, DataConfig, ModelConfig, UserError
+from pewm_jax.config import ArraySpec, BatchSpec, ConfigError, DataConfig, UserError
 from pewm_jax.data import clips, loader
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.dataset import EpisodeSource
@@ -31,6 +31,7 @@ from pewm_jax.data.voxelise import crop_grids, fill, lattice_of, split_at_border
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig, class_ids, table_colours
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.houses.kinds import GROUPS, KINDS, OTHER, kind_of
+from pewm_jax.worlds.pewm.world import PEWM
 from tests.data.test_importer import config as import_config
 from tests.data.test_importer import record
 from tests.data.two_rooms import arrays, write_split
@@ -263,7 +264,7 @@ def test_a_clip_has_the_grids_of_its_frames():
 
 
 @dataclasses.dataclass(frozen=True)
-class Voxels(ModelConfig):
+class Voxels(PEWM):
     """A model whose loss needs the voxels around the agent."""
 
     @property

@@ -10,7 +10,6 @@ from pewm_jax.config import ConfigError, TrainConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import objective, world_model
-from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import TINY, init_world, random_frames, randomise, tiny_model
 
 
@@ -107,7 +106,7 @@ def make_clip(seed=0, batch=2, context=3):
     return jax.tree.map(lambda *x: np.stack(x), *clips)
 
 
-sample = jax.jit(pewm.sample, static_argnums=0)
+sample = jax.jit(world_model.sample, static_argnums=0)
 
 
 def conditioning_of(model, params, clip):

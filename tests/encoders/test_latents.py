@@ -14,7 +14,7 @@ from pewm_jax import worlds
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import CodecWorldConfig, Config, ConfigError, DataConfig, UserError
+from pewm_jax.config import Config, ConfigError, DataConfig, UserError
 from pewm_jax.convert import stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders.latents import LatentsConfig
@@ -31,6 +31,7 @@ from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import feed
 from pewm_jax.types import Clip, Control, EncodedView, Frames, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds.codec import CodecTask
 from pewm_jax.worlds.pewm import world as pewm
 from tests import properties
 from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
@@ -73,7 +74,7 @@ GRID = (5, 2, 3)
 apply = jax.jit(world_model.apply, static_argnums=0)
 condition = jax.jit(world_model.condition, static_argnums=0)
 look = jax.jit(objective.clip_readout, static_argnums=0)
-start = jax.jit(pewm.start, static_argnums=0)
+start = jax.jit(pewm.PEWM.start, static_argnums=0)
 encode_rgbd = jax.jit(rgbd.encode_rgbd, static_argnums=0)
 features = jax.jit(
     lambda model, *given: model.memory.encoder.features(model, *given), static_argnums=0
@@ -359,7 +360,7 @@ def test_what_has_no_meaning_is_refused_in_a_sentence():
     with pytest.raises(ConfigError, match=r"no cache is kept: leave data\.features empty"):
         Config(model=model, data=DataConfig(features="kept"))
     with pytest.raises(ConfigError, match="keeps colours alone"):
-        CodecWorldConfig(memory=dataclasses.replace(SURFELS, encoder=ENCODER))
+        CodecTask(memory=dataclasses.replace(SURFELS, encoder=ENCODER))
     with pytest.raises(UserError, match="are not kept in a cache"):
         feature_cache.fingerprint(ENCODER, {}, None)
     with pytest.raises(UserError, match="takes the weights of the codec"):

@@ -6,15 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import (
-    ActionConfig,
-    ClipConfig,
-    Config,
-    DataConfig,
-    EvalConfig,
-    ModelConfig,
-    TrainConfig,
-)
+from pewm_jax.config import ActionConfig, ClipConfig, Config, DataConfig, EvalConfig, TrainConfig
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.diffusion.ddpm import DDPMConfig
@@ -24,6 +16,7 @@ from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.types import Camera, Frames
+from pewm_jax.worlds.pewm.world import PEWM
 
 SIZE = 16
 
@@ -32,7 +25,7 @@ def tiny(tmp, **evaluate):
     """A configuration small enough to sample in a second."""
     settings = {"clips": 4, "seeds": (0, 1), "videos": 1, "video_clips": 2, "batch": 2}
     return Config(
-        model=ModelConfig(
+        model=PEWM(
             clip=ClipConfig(frames=5, height=SIZE, width=SIZE),
             backbone=DiTBackbone(
                 layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16

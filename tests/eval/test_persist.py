@@ -10,12 +10,13 @@ import pytest
 
 from pewm_jax import config as configuration
 from pewm_jax import worlds
-from pewm_jax.config import Config, DataConfig, EvalConfig, PersistTrainConfig
+from pewm_jax.config import Config, DataConfig, EvalConfig
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
 from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.eval import evaluate as report
 from pewm_jax.io import weights
+from pewm_jax.worlds.persist.config import PersistTrainConfig
 from tests.worlds.persist.tiny_persist import MODEL
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import Config, EgoWMConfig, EgoWMTrainConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.eval import steering
 from pewm_jax.eval.clips import choose
 from pewm_jax.eval.steering import Walks, choose_walks, different_steps, forward_steps
@@ -18,9 +18,10 @@ from pewm_jax.report import evaluation_page
 from pewm_jax.report.labels import ACTIONS_NAMES, format_steering
 from pewm_jax.report.page import render
 from pewm_jax.types import Frames
+from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 from tests.helpers import tiny_config
 
-CONFIG = Config(model=EgoWMConfig(), train=EgoWMTrainConfig())
+CONFIG = Config(model=EgoWM(), train=EgoWMTrainConfig())
 PARAMS = {"control": {"kernel": np.ones(())}}
 UNITS, IMAGINED = CONFIG.model.actions, CONFIG.model.clip.frames - 1
 

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import Config, PersistTrainConfig, UserError
+from pewm_jax.config import Config, UserError
 from pewm_jax.eval import voxel_trials
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.types import Camera, Frames, WorldState
 from pewm_jax.worlds.persist import world as persist
+from pewm_jax.worlds.persist.config import PersistTrainConfig
 from tests.worlds.persist.tiny_persist import MODEL
 
 FRAMES = 5
@@ -54,7 +55,7 @@ def standing(monkeypatch):
         return state, dataclasses.replace(frames(len(actions)), rgb_THWC=rgb)
 
     monkeypatch.setattr(persist, "start_in", start_in)
-    monkeypatch.setattr(persist, "imagine", imagine)
+    monkeypatch.setattr(persist.PERSIST, "imagine", imagine)
     return monkeypatch
 
 

@@ -13,26 +13,19 @@ from examples.control import PushConfig
 from examples.memory import NewestConfig
 from examples.noise import CosineConfig
 from pewm_jax import worlds
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DataConfig,
-    MeshConfig,
-    ModelConfig,
-    StageConfig,
-    TrainConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, MeshConfig, StageConfig, TrainConfig
 from pewm_jax.data import abstract
 from pewm_jax.plan import measure
 from pewm_jax.readers.both import BothConfig
 from pewm_jax.train import sharding, step
+from pewm_jax.worlds.pewm.world import PEWM
 from tests.helpers import random_frames
 
 
 def experiment(mesh=None, run="runs/parts", batch=8, width=32) -> Config:
     stage = StageConfig(steps=2, batch=batch, warmup=1)
     return Config(
-        model=ModelConfig(
+        model=PEWM(
             clip=ClipConfig(frames=4, height=16, width=16),  # a number that no fold by 4 allows
             codec=TurnConfig(),
             backbone=PerceptronConfig(width=width),

@@ -159,7 +159,7 @@ def test_every_memory_can_be_drawn(kind):
     model = model_of(kind)
     memory, _ = seen(model, scene(), ALL)
     places, values, valid = model.memory.to_points(model, memory)
-    shades = memories.colours(model, values)
+    shades = model.point_colours(values)
     assert shades.shape == places.shape == (len(valid), 3)
     assert np.abs(np.asarray(shades)).max() <= 1 + 1e-6
     assert bool(valid.any()) == (kind != "none")

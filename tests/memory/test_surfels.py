@@ -272,7 +272,7 @@ def test_surfels_show_a_house_better_than_the_voxel_map():
             colours, readout = view.features_THWF, view.seen_THW
         else:
             view = memories.render(model, memory, target.camera, 64, 64)
-            flat = memories.colours(model, view.features_THWF.reshape(-1, encoder.channels))
+            flat = model.point_colours(view.features_THWF.reshape(-1, encoder.channels))
             colours, readout = flat.reshape(truth.shape), view.seen_THW
         filled = views.fill_nearest(rendering.View(colours, view.depth_THW, readout))
         reached[name] = decibels(filled.features_THWF, truth, seen)

@@ -10,7 +10,6 @@ from pewm_jax.memory import rendering
 from pewm_jax.memory import rendering as views
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.types import Camera, Frames, MemoryReadout, View
-from pewm_jax.worlds.pewm import world as pewm
 from tests.helpers import random_camera, tiny_model
 
 SIZE = (16, 24)
@@ -127,7 +126,7 @@ def test_what_the_memory_showed_is_not_remembered_again_as_imagined():
     seen[0, 2, :, :5] = True
     shown = MemoryReadout(view=View(np.zeros((1, 3, *SIZE, 3)), np.ones(seen.shape), seen))
     model = tiny_model(memory=FINE)
-    new = np.asarray(pewm.new_surfaces(model, two, shown).depth_THW)
+    new = np.asarray(model.new_surfaces(two, shown).depth_THW)
     np.testing.assert_array_equal(new, np.where(seen[0, 1:], 0, 2).astype(np.float32))
     again = tiny_model(memory=SurfelConfig(**{**vars(FINE), "imagined_again": True}))
     for whole, readout in (
@@ -136,4 +135,4 @@ def test_what_the_memory_showed_is_not_remembered_again_as_imagined():
         (again, shown),
         (tiny_model(), shown),
     ):
-        assert pewm.new_surfaces(whole, two, readout) is two
+        assert whole.new_surfaces(two, readout) is two

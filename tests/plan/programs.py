@@ -9,15 +9,7 @@ import sys
 from typing import Literal
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    DataConfig,
-    MeshConfig,
-    ModelConfig,
-    StageConfig,
-    TrainConfig,
-)
+from pewm_jax.config import ClipConfig, Config, DataConfig, MeshConfig, StageConfig, TrainConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
@@ -28,7 +20,7 @@ from pewm_jax.plan import hlo, measure, suggest
 from pewm_jax.plan.measure import MeshSizes
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.both import BothConfig
-from pewm_jax.worlds.pewm.world import STAGES
+from pewm_jax.worlds.pewm.world import PEWM, STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)
 ENCODERS = {
@@ -82,7 +74,7 @@ def experiment(
         remat=remat,
     )
     return Config(
-        model=ModelConfig(
+        model=PEWM(
             clip=ClipConfig(frames=9, height=size, width=size),
             codec=codec or PixelConfig(spatial=2),
             backbone=backbone,

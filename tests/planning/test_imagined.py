@@ -13,7 +13,6 @@ from gymnasium.utils.env_checker import check_env
 import pewm_jax
 from pewm_jax import presets, worlds
 from pewm_jax.config import UserError
-from pewm_jax.config.codec_world import CodecWorldConfig
 from pewm_jax.data.simulator import open_simulator
 from pewm_jax.data.trajectories import advance
 from pewm_jax.geometry.cameras import pose_from_yaw
@@ -22,6 +21,7 @@ from pewm_jax.planning.house import HouseEnv
 from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.planning.imagined_env import WorldModelEnv
 from pewm_jax.planning.observations import planar_of
+from pewm_jax.worlds.codec import CodecTask
 from tests.helpers import init_world, randomise
 from tests.planning.page import blocks
 
@@ -268,7 +268,7 @@ def test_what_cannot_be_is_refused_in_a_sentence(params):
             "start() got colours",
         ),
         (lambda: WorldModelEnv(CONFIG, params, render_mode="human"), "no render_mode 'human'"),
-        (lambda: WorldModelEnv(CodecWorldConfig(), {}), "CodecWorldConfig has no actions"),
+        (lambda: WorldModelEnv(CodecTask(), {}), "CodecTask has no actions"),
         (lambda: WorldModelEnv(CONFIG, params, render_mode="rgb_array").render(), "first reset"),
     ):
         with pytest.raises(UserError, match=re.escape(says)) as caught:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import ActionConfig, ConfigError, UserError
-from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.geometry.actions import discrete_table, integrate
 from pewm_jax.io import tree
 from pewm_jax.models.nomad import model as nomad
+from pewm_jax.models.nomad.config import NomadConfig
 from pewm_jax.planning import nomad_policy
 
 TINY = NomadConfig(

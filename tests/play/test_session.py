@@ -17,11 +17,12 @@ import pewm_jax
 from pewm_jax import worlds
 from pewm_jax.cli import parser as cli
 from pewm_jax.cli import play
-from pewm_jax.config import CodecTrainConfig, CodecWorldConfig, Config, ConfigError, UserError
+from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.data.navigation import is_free
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.play import board, engine, picking, places, saved, session
 from pewm_jax.play.settings import Serve, Start
+from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 from tests.play.tiny_drive import (
     FORWARD,
     LEFT,
@@ -36,7 +37,7 @@ from tests.worlds.persist.tiny_persist import MODEL as PERSIST
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "play.md").read_text()
-CODEC = Config(model=CodecWorldConfig(), train=CodecTrainConfig())
+CODEC = Config(model=CodecTask(), train=CodecTrainConfig())
 
 
 def boxed(points, box):

@@ -178,7 +178,7 @@ def test_a_rollout_looks_as_training_does(memory):
     readout = look(model, {}, batch)
     assert readout.view.features_THWF.shape == (2, 9, 16, 24, model.memory.rendered_channels)
     assert readout.view.seen_THW.mean() > 0.1
-    start = jax.jit(pewm.start, static_argnums=0)
+    start = jax.jit(pewm.PEWM.start, static_argnums=0)
     again = jax.jit(functools.partial(memories.readout, model))
     for i in range(2):
         frames = jax.tree.map(lambda x, i=i: x[i], batch.frames)

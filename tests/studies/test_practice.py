@@ -23,7 +23,6 @@ from pewm_jax.studies import practice as study
 from pewm_jax.studies.practice import COLUMNS
 from pewm_jax.studies.practice_piece import LEARNED, ROWS, PracticeConfig
 from pewm_jax.types import Camera, Frames
-from pewm_jax.worlds import nomad as nomad_world
 from tests.helpers import init_world, randomise
 from tests.planning.page import blocks
 from tests.train.test_nomad import experiment
@@ -66,7 +65,7 @@ def made(tmp_path_factory, world):
     policy = dataclasses.replace(policy, model=dataclasses.replace(policy.model, clip=_clip(8)))
     weights.save(
         folder / "policy" / "weights.safetensors",
-        nomad_world.init(policy.model, jax.random.key(1)),
+        policy.model.init(jax.random.key(1)),
     )
     configuration.save(policy, folder / "policy" / "config.json")
     page = study.run(

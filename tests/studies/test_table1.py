@@ -514,8 +514,8 @@ def test_the_walk_back_passes_the_same_cameras():
         (["--seeds", "1", "1"], "give distinct training seeds"),
         (["--seeds", "0", "-1"], "give distinct training seeds of 0 or more"),
         (["--ablate", "cell", "--rows", "none"], "rows apply to the table, not to an ablation"),
-        (["--preset", "nomad"], "of a NomadWorldConfig, but Table 1 compares memories"),
-        (["--preset", "codec"], "of a CodecWorldConfig, but Table 1 compares memories"),
+        (["--preset", "nomad"], "of a NomadTask, but Table 1 compares memories"),
+        (["--preset", "codec"], "of a CodecTask, but Table 1 compares memories"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):

@@ -16,7 +16,7 @@ from pewm_jax.io import weights
 from pewm_jax.planning import costs, scores
 from pewm_jax.planning.settings import PlanConfig
 from pewm_jax.studies import deciders, goals, table2
-from pewm_jax.worlds.pewm import world as pewm
+from pewm_jax.worlds import world_model
 from tests.helpers import init_world, randomise
 
 MOTION = ActionConfig()
@@ -257,7 +257,7 @@ def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
     config = presets.load("tiny")
     stage2 = dataclasses.replace(config.train.stage2, steps=0)
     config = dataclasses.replace(config, train=dataclasses.replace(config.train, stage2=stage2))
-    params = pewm.init(config.model, jax.random.key(1), memory=False)
+    params = world_model.init(config.model, jax.random.key(1), memory=False)
     weights.save(tmp_path / "none" / "weights.safetensors", params)
     configuration.save(config, tmp_path / "none" / "config.json")
     errand = dataclasses.replace(

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax.config import ClipConfig, Config, DataConfig, ModelConfig, StageConfig, TrainConfig
+from pewm_jax.config import ClipConfig, Config, DataConfig, StageConfig, TrainConfig
 from pewm_jax.data import loader
 from pewm_jax.train import sharding
 from pewm_jax.types import Camera, Clip, Frames
 from pewm_jax.worlds.pewm import world as pewm
+from pewm_jax.worlds.pewm.world import PEWM
 
 SIZE = 16
 
@@ -21,7 +22,7 @@ def config(run="runs/fake", *, stage1=6, stage2=6, dtype="float32", **train) -> 
     settings = {"batch": 8, "warmup": 2, "learning_rate": 1e-2}
     train = {"save_every": 3, "log_every": 1, "preview_every": 0, "ema": 0.5} | train
     return Config(
-        model=ModelConfig(clip=ClipConfig(frames=5, height=SIZE, width=SIZE), dtype=dtype),
+        model=PEWM(clip=ClipConfig(frames=5, height=SIZE, width=SIZE), dtype=dtype),
         data=DataConfig(context=1),
         train=TrainConfig(
             run=str(run),
@@ -130,9 +131,9 @@ RULES = ((r"(backbone|memory)/(kernel|bias|gate)", sharding.WHOLE),)
 
 def install(patch, loss=loss):
     """Put the small model and its clips in place of the real ones."""
-    real = pewm.sharding
+    real = pewm.PEWM.sharding
     patch.setattr(pewm, "STAGES", replaced(loss))
-    patch.setattr(pewm, "sharding", lambda model: (*RULES, *real(model)))
+    patch.setattr(pewm.PEWM, "sharding", lambda model: (*RULES, *real(model)))
     patch.setattr(loader, "clips", clips)
     patch.setattr(loader, "records", records)
 

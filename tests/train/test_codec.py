@@ -16,8 +16,6 @@ from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ClipConfig,
-    CodecTrainConfig,
-    CodecWorldConfig,
     Config,
     ConfigError,
     DataConfig,
@@ -35,7 +33,7 @@ from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.plan import plan
 from pewm_jax.train import loading, loop, stages, step
-from pewm_jax.worlds import codec as world
+from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 from tests.helpers import random_camera
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
@@ -47,7 +45,7 @@ def experiment(run="runs/it", steps=2, **train):
     settings = {"save_every": 1, "log_every": 1, "ema": 0.0, "codec": stage} | train
     settings.setdefault("statistics", dataclasses.replace(stage, learning_rate=0.03))
     return Config(
-        model=CodecWorldConfig(clip=ClipConfig(frames=2, height=16, width=24), codec=TINY),
+        model=CodecTask(clip=ClipConfig(frames=2, height=16, width=24), codec=TINY),
         data=DataConfig(context=1),
         train=CodecTrainConfig(run=str(run), **settings),
     )
@@ -148,7 +146,7 @@ def test_depth_that_was_not_measured_does_not_count():
                 jax.random.key(0),
             )[1]
         )
-    truth, counts = world.pictures(config.model, clip)
+    truth, counts = config.model.pictures(clip)
     lower = np.abs(truth[1])[:, 8:].mean()
     pixels = float(lower) + train.squared_weight * float((np.asarray(truth[1])[:, 8:] ** 2).mean())
     slopes = sum(float(np.abs(np.diff(np.asarray(truth[1])[:, 8:], axis=a)).mean()) for a in (1, 2))
@@ -298,7 +296,7 @@ def test_a_model_starts_from_it_and_is_refused_without_it(clips, tmp_path):
 
 def test_what_cannot_work_is_refused_in_a_sentence():
     with pytest.raises(ConfigError, match=r"codec is a PixelConfig, .* use codec\.kind learned"):
-        CodecWorldConfig(codec=PixelConfig())
+        CodecTask(codec=PixelConfig())
     with pytest.raises(ConfigError, match=r"train\.preview_every is 5: a codec imagines nothing"):
         CodecTrainConfig(preview_every=5)
     with pytest.raises(ConfigError, match=r"train\.latent_noise is -1: use 0 or more"):

@@ -15,8 +15,6 @@ from pewm_jax.config import (
     Config,
     ConfigError,
     DataConfig,
-    EgoWMConfig,
-    EgoWMTrainConfig,
     MeshConfig,
     StageConfig,
     TrainConfig,
@@ -32,6 +30,7 @@ from pewm_jax.plan.measure import QUICK
 from pewm_jax.train import flops, sharding
 from pewm_jax.train import step as state
 from pewm_jax.worlds import world_model
+from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 from tests.helpers import TINY, init_world, random_frames, randomise, with_reader
 from tests.train import fakes
 from tests.train.test_egowm import changed, trained
@@ -52,7 +51,7 @@ VAE = WanVAECodec(
     depth=False,
 )
 NOISE = EDMConfig(sigma_data=1.0, target="flow", ends="sigma_min", sample_steps=2)
-MODEL = EgoWMConfig(
+MODEL = EgoWM(
     clip=ClipConfig(frames=5, height=16, width=12, depth=False),
     codec=VAE,
     backbone=COSMOS,

@@ -14,8 +14,6 @@ from pewm_jax.config import (
     Config,
     ConfigError,
     DataConfig,
-    EgoWMConfig,
-    EgoWMTrainConfig,
     MeshConfig,
     StageConfig,
     TrainConfig,
@@ -33,6 +31,7 @@ from pewm_jax.plan import hlo
 from pewm_jax.plan.measure import QUICK
 from pewm_jax.train import flops, sharding, step
 from pewm_jax.train import step as state
+from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 from tests.helpers import TINY, randomise, with_reader
 from tests.train import fakes
 
@@ -49,7 +48,7 @@ UNET = SVDUNetBackbone(
     added_dim=8,
     image=IMAGE,
 )
-SVD = EgoWMConfig(
+SVD = EgoWM(
     clip=ClipConfig(frames=3, height=16, width=16, depth=False),
     codec=SVDVAECodec(widths=(32,), depth=False),
     backbone=UNET,

@@ -11,16 +11,7 @@ import pewm_jax
 from pewm_jax import shipped, worlds
 from pewm_jax.codecs import gates
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.config import (
-    ClipConfig,
-    CodecTrainConfig,
-    CodecWorldConfig,
-    Config,
-    ConfigError,
-    DataConfig,
-    StageConfig,
-    UserError,
-)
+from pewm_jax.config import ClipConfig, Config, ConfigError, DataConfig, StageConfig, UserError
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
 from pewm_jax.memory.surfels import SurfelConfig
@@ -31,6 +22,7 @@ from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import loop, stages
 from pewm_jax.types import Frames
 from pewm_jax.worlds import codec as codec_gate
+from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 from pewm_jax.worlds.rollouts import load_finished
 from tests.helpers import TINY, init_world, random_camera, randomise, tiny_config
 
@@ -47,9 +39,7 @@ def experiment(run="runs/it", **steps):
     }
     memory = SurfelConfig(capacity=2048, cell_m=(0.02, 0.02, 0.02))
     return Config(
-        model=CodecWorldConfig(
-            clip=ClipConfig(frames=3, height=16, width=24), codec=CODEC, memory=memory
-        ),
+        model=CodecTask(clip=ClipConfig(frames=3, height=16, width=24), codec=CODEC, memory=memory),
         data=DataConfig(context=2),
         train=CodecTrainConfig(run=str(run), save_every=1, log_every=1, ema=0.0, **each),
     )
@@ -124,7 +114,7 @@ def test_weights_that_come_with_the_library_are_found_by_name(tmp_path, monkeypa
         assert (shipped.find(name) / "README.md").is_file()
         assert all(np.isfinite(leaf.astype(np.float32)).all() for leaf in jax.tree.leaves(params))
         assert all(leaf.dtype.itemsize == 2 for leaf in jax.tree.leaves(params))
-        if isinstance(config.model, CodecWorldConfig):
+        if isinstance(config.model, CodecTask):
             video = jnp.zeros((1, 2, 16, 24, 3))
             latents = config.model.codec.encode(params["codec"], video)
             assert latents.shape == (1, 2, 2, 3, 16)

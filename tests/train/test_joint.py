@@ -27,9 +27,9 @@ def test_joint_starts_from_the_weights_of_stage_2_and_leaves_the_codec(
     fake_model, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(pewm, "STAGES", tuple(map(with_codec, pewm.STAGES)))
-    known = pewm.sharding
+    known = pewm.PEWM.sharding
     rules = ((r"codec/kernel", sharding.WHOLE),)
-    monkeypatch.setattr(pewm, "sharding", lambda model: (*rules, *known(model)))
+    monkeypatch.setattr(pewm.PEWM, "sharding", lambda model: (*rules, *known(model)))
     starts, make = {}, loop.initial_state
 
     def noting(config, stage, mesh, start):

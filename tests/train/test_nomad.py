@@ -9,16 +9,7 @@ import pytest
 
 import pewm_jax
 from pewm_jax import presets
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    ConfigError,
-    DataConfig,
-    NomadTrainConfig,
-    NomadWorldConfig,
-    StageConfig,
-    UserError,
-)
+from pewm_jax.config import ClipConfig, Config, ConfigError, DataConfig, StageConfig, UserError
 from pewm_jax.data import abstract, loader
 from pewm_jax.eval import loaded_run as opened
 from pewm_jax.geometry.actions import discrete_table, integrate
@@ -26,12 +17,12 @@ from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.io import tree
 from pewm_jax.planning import nomad_policy
 from pewm_jax.train import loop
-from pewm_jax.worlds import nomad as world
+from pewm_jax.worlds.nomad import NomadTask, NomadTrainConfig
 from tests.planning.test_nomad import STEPS
 from tests.planning.test_nomad import TINY as POLICY
 
 TINY = dataclasses.replace(POLICY, channels=(16,), lowest=(-1.2, -1.2), highest=(1.2, 1.2))
-MODEL = NomadWorldConfig(clip=ClipConfig(frames=8, height=12, width=16), policy=TINY)
+MODEL = NomadTask(clip=ClipConfig(frames=8, height=12, width=16), policy=TINY)
 follow = jax.jit(integrate)
 WALKS = [0, 0, 0, 0, 0, 0], [1, 0, 0, 1, 0, 0], [2, 0, 0, 2, 0, 0]
 """Of the toy, after the present picture: straight, to the left, to the right."""
@@ -78,7 +69,7 @@ def clips(monkeypatch):
 
 def test_waypoints_are_the_places_of_the_next_steps():
     clip, kinds = batch(experiment(), 6)
-    found = np.asarray(world.waypoints(MODEL, clip))
+    found = np.asarray(MODEL.waypoints(clip))
     start = pose_from_yaw(np.zeros(3), 0.0, 0.0)
     for each, kind in zip(found, kinds, strict=True):
         walk = discrete_table(STEPS)[WALKS[kind][:4]]
@@ -130,7 +121,7 @@ def test_training_goes_on_and_what_comes_out_is_read(tmp_path, clips):
 
 def test_the_preset_can_be_read():
     config = presets.load("nomad")
-    assert isinstance(config.model, NomadWorldConfig)
+    assert isinstance(config.model, NomadTask)
     assert config.model.farthest >= config.model.policy.waypoints
 
 

@@ -114,8 +114,8 @@ def test_a_batch_that_devices_cannot_share_is_refused(fake_model):
 
 def test_every_leaf_of_the_state_needs_a_sharding_rule(monkeypatch):
     model = configs.load("tiny").model
-    first = pewm.sharding(model)[:1]
-    monkeypatch.setattr(pewm, "sharding", lambda model: first)
+    first = model.sharding()[:1]
+    monkeypatch.setattr(pewm.PEWM, "sharding", lambda model: first)
     with pytest.raises(tree.TreeError, match="sharding rules matches params/w"):
         sharding.of_state(model, sharding.make_mesh(), {"step": 0, "params": {"w": 0}})
 

@@ -16,12 +16,12 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.errors import UserError
 from pewm_jax.io import tree, weights
 from pewm_jax.io.published import CONV, LINEAR, Entry, Transform
 from pewm_jax.models.nomad import efficientnet
 from pewm_jax.models.nomad import model as nomad
+from pewm_jax.models.nomad.config import NomadConfig
 from pewm_jax.types import Params
 
 UNUSED = (

@@ -20,10 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config.nomad import PLANE, NomadConfig
 from pewm_jax.errors import UserError
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.nomad import efficientnet
+from pewm_jax.models.nomad.config import PLANE, NomadConfig
 from pewm_jax.nn.layers import group_norm, layer_norm, linear, merge_heads, split_heads
 from pewm_jax.nn.parameters import draw
 from pewm_jax.types import Array, Params

@@ -7,7 +7,6 @@ import math
 from typing import Literal
 
 from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.egowm import EgoWMConfig, EgoWMTrainConfig
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.mesh import MeshConfig
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig
@@ -17,6 +16,7 @@ from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.vae_codec import SVDVAECodec
 from pewm_jax.models.wan.codec import WanVAECodec
+from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 
 NOISE = EDMConfig(sigma_data=1.0, sigma_max=700.0, target="v", sample_steps=25)
 """The published scheduler of Stable Video Diffusion."""
@@ -53,7 +53,7 @@ def experiment(
     """
     height, width = size
     return Config(
-        model=EgoWMConfig(
+        model=EgoWM(
             clip=ClipConfig(frames=9, height=height, width=width, depth=False),
             codec=dataclasses.replace(vae, depth=False),
             backbone=dataclasses.replace(unet, motion_bucket=180.0, remat=True),
@@ -102,7 +102,7 @@ def cosmos_experiment(
     """
     frames, height, width = clip
     return Config(
-        model=EgoWMConfig(
+        model=EgoWM(
             clip=ClipConfig(frames=frames, height=height, width=width, depth=False),
             codec=dataclasses.replace(vae, depth=False),
             backbone=dataclasses.replace(transformer, remat=True),

@@ -1,18 +1,16 @@
 """The world of EgoWM: a video model steered by actions, chunk after chunk (arXiv 2601.15284).
 
-There is no map: all that a chunk knows of the past are the last frames, observed or imagined, which
-are shown to the backbone as it learned to be shown them (``backbones.observed``). Guidance is on
-these frames alone, or on the text of a backbone that has one (``world_model.blind``): without them,
-actions steer on (``noise.guidance``; 2 in the paper). A chunk is
-denoised as a whole, so all its frames see all its actions, where the backbone's attention over time
-looks both ways; earlier chunks never see the actions of later ones.
+There is no map. A chunk is conditioned on the last frames, observed or imagined, in the form that
+the backbone was trained with (``Backbone.observed``). Guidance (``noise.guidance``; 2 in the paper)
+is on these frames, or on the text of a backbone that has one (``world_model.blind``); the actions
+condition both predictions. A chunk is denoised as a whole: if the backbone's attention over time is
+bidirectional, all its frames attend to all its actions, but not to those of later chunks.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -20,156 +18,250 @@ import numpy as np
 
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import EgoWMConfig, EgoWMTrainConfig, TrainSettings
+from pewm_jax.config import (
+    AssembledModel,
+    BatchSpec,
+    Capabilities,
+    Conditioner,
+    Memory,
+    StageConfig,
+    TrainSettings,
+    register,
+)
+from pewm_jax.errors import require
+from pewm_jax.registry import part
 from pewm_jax.types import Array, Clip, Control, Frames, Params, WorldState
-from pewm_jax.worlds import objective, world_model
+from pewm_jax.worlds import checks, objective, world_model
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
-from pewm_jax.worlds.pewm import world as pewm
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
-memory_points, point_colours = pewm.memory_points, pewm.point_colours
-init = functools.partial(world_model.init, memory=False)
-sharding = pewm.sharding
-split_heads = pewm.split_heads
+
+@dataclasses.dataclass(frozen=True)
+class EgoWMTrainConfig(TrainSettings):
+    """How a video model becomes a world model: the whole backbone is trained, with actions."""
+
+    run: str = "runs/egowm"
+    """Folder of this run: checkpoints, logs, images, report."""
+    video: StageConfig = StageConfig(steps=0)
+    """If there is no pre-trained video model, the backbone first becomes one, without actions; by
+    default left out. A random backbone trained with actions from the start would not learn to
+    follow them: the control and what it modulates are initialized with zeros, so neither gets a
+    gradient."""
+    adapt: StageConfig = StageConfig()
+    """The backbone is trained further, with actions; the control's learning rate is
+    `model.control.rate` times this one's."""
+    blind: float = 0.1
+    """Share of clips from which is hidden what guidance is on, the observed image or the text;
+    needed for `model.noise.guidance` above 1."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
+        require(
+            self.hidden == 0 and self.chained == 0,
+            f"train.hidden is {self.hidden} and train.chained {self.chained}: this world has no "
+            "memory to hide, and its clips cannot be run backwards; use 0 for both.",
+        )
 
 
-def loss(
-    model: EgoWMConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Return the backbone's own loss, of clips with actions; see ``objective.loss``."""
-    assert isinstance(train, EgoWMTrainConfig)
-    return objective.loss(
-        model, train, params, clip, key, memory=False, history=model.history, blind=train.blind
-    )
+@register("world", "egowm")
+@dataclasses.dataclass(frozen=True)
+class EgoWM(AssembledModel):
+    """A video diffusion model steered by actions (EgoWM, arXiv 2601.15284)."""
+
+    TRAIN: ClassVar[type[TrainSettings]] = EgoWMTrainConfig
+
+    control: Conditioner = part("control", "actions")
+    """Control: what steers a clip."""
+    memory: Memory = part("memory", "none", reader=part("reader", "render"))
+    """There is none: leave it at `none`."""
+    history: int = 1
+    """Frames that every clip begins with and that are observed, or were imagined before: 1 in
+    Stable Video Diffusion and CogVideoX; more where a backbone learns with more. They fill latent
+    frames: with `codec.temporal` 4, use 4k + 1."""
+    image_noise: float = 0.0
+    """Deviation of the noise on these frames while imagining; the paper's is 0.1, with Stable Video
+    Diffusion. In training it is drawn as `train` says."""
+
+    @property
+    def batch_spec(self) -> BatchSpec:
+        """The clip's frames and actions alone."""
+        return dataclasses.replace(super().batch_spec, context=False, features=None)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a world without a memory can do."""
+        return dataclasses.replace(super().capabilities, memory_parameters="")
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(
+            not self.memory.REMEMBERS,
+            "model.memory is of a kind that remembers, and the world egowm has no map: use "
+            "memory.kind none, or the world pewm with control.kind actions.",
+        )
+        q = self.codec.temporal
+        require(
+            1 <= self.history < self.clip.frames and (self.history - 1) % q == 0,
+            f"model.history is {self.history}: use {q}k + 1 frames (they fill latent frames), and "
+            f"fewer than clip.frames ({self.clip.frames}).",
+        )
+        require(
+            self.noise.guidance == 1
+            or not self.backbone.GUIDED_BY_TEXT
+            or self.backbone.stores_prompt,
+            f"noise.guidance is {self.noise.guidance}, which this backbone has on its text, and no "
+            "text is stored: use backbone.prompt stored and weights that were imported with a text "
+            "encoder, or noise.guidance 1.",
+        )
+        require(self.image_noise >= 0, f"model.image_noise is {self.image_noise}: use 0 or more.")
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters of all parts; there is no reader."""
+        return world_model.init(self, key, memory=False)
+
+    def loss(
+        self, train: TrainSettings, params: Params, clip: Clip, key: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the backbone's own loss, of clips with actions; see ``objective.loss``."""
+        assert isinstance(train, EgoWMTrainConfig)
+        return objective.loss(
+            self, train, params, clip, key, memory=False, history=self.history, blind=train.blind
+        )
+
+    def prepare(self, params: Params, clip: Clip) -> Clip:
+        """Encode a batch's frames; see ``objective.prepare``."""
+        return objective.prepare(self, params, clip, memory=False)
+
+    def stages(self) -> tuple[Stage, ...]:
+        """Return the two stages.
+
+        In ``video`` the backbone becomes a video model; the control is frozen, and has no effect at
+        first. In ``adapt`` all of the backbone is trained further, with actions.
+        """
+        video = Stage(
+            name="video",
+            number=1,
+            rules=((r"backbone/.*", TRAIN), (r"(control|codec|image|text)/.*", FREEZE)),
+            init=EgoWM.init,
+            loss=EgoWM.loss,
+            prepare=EgoWM.prepare,
+            optional=True,
+        )
+        adapt = dataclasses.replace(
+            video,
+            name="adapt",
+            number=2,
+            rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|image|text)/.*", FREEZE)),
+            optional=False,
+            rates=((r"control/.*", self.control.rate),),
+        )
+        return video, adapt
+
+    def start(self, params: Params, frames: Frames) -> WorldState:
+        """Begin a world; see ``worlds.start``.
+
+        If there are fewer frames than ``history``, the first is repeated.
+        """
+        del params
+        checks.require_frames(self, frames, "start")
+        return self._state(jax.tree.map(jnp.asarray, as_signal(frames)))
+
+    def observe(self, params: Params, state: WorldState, frames: Frames) -> WorldState:
+        """Observe real frames; see ``worlds.observe``."""
+        del params
+        checks.require_frames(self, frames, "observe")
+        return self._state(_joined(state.map, state.frame, as_signal(frames)))
+
+    def imagine(
+        self,
+        params: Params,
+        state: WorldState,
+        control: Any,
+        key: Array,
+        *,
+        remember: bool = True,
+        memory: bool = True,
+    ) -> tuple[WorldState, Frames]:
+        """Imagine chunk after chunk; see ``worlds.imagine``.
+
+        There is no memory to ignore. Without ``remember`` the state keeps its frames before the
+        present one; with a ``history`` of 1 there are none, and the results are the same.
+        """
+        del memory
+        asked = control_of(self, state.frame.camera, control)
+        count = asked.camera.world_from_camera.shape[0]
+        chunked, wanted = cut_into_clips(asked, self.clip.frames - self.history)
+        keys = jax.random.split(key, chunked.camera.world_from_camera.shape[0])
+
+        def step(
+            past: Frames, inputs: tuple[Control, Array, Array | None]
+        ) -> tuple[Frames, Frames]:
+            chunk, chunk_key, valid = inputs
+            frames = self.imagine_chunk(params, past, chunk, chunk_key)
+            seen = None if valid is None else valid.sum() + self.history
+            return last_frames(_joined(past, frames), seen, self.history), frames
+
+        past, frames = jax.lax.scan(step, _joined(state.map, state.frame), (chunked, keys, wanted))
+        after = self._state(past)
+        if not remember:
+            after = WorldState(after.frame, state.map)
+        return after, join_clips(frames, count)
+
+    def imagine_chunk(self, params: Params, past: Frames, control: Control, key: Array) -> Frames:
+        """Imagine one chunk.
+
+        Args:
+            params: the world model's parameters.
+            past: (history) frames before it, colours float in [−1, 1]; the last one is the present.
+            control: (n) cameras of the frames to imagine, with n = clip.frames − history, and
+                actions that lead to them.
+            key: randomness of the noise.
+
+        Returns:
+            n frames; depth is 0 where the denoiser works without it (``clip.depth``).
+        """
+        before = self.history - 1
+        actions = control.actions_TA
+        if actions is not None:  # of those that led to the past frames the control makes nothing
+            actions = jnp.pad(actions, ((before, 0), (0, 0)))
+        camera = _joined(past.camera, control.camera)
+        noise_key, key = jax.random.split(key)
+        rgb = past.rgb_THWC
+        if self.image_noise:
+            rgb = rgb + self.image_noise * jax.random.normal(noise_key, rgb.shape)
+        noisy = dataclasses.replace(past, rgb_THWC=rgb)
+        observed, whole = jax.tree.map(
+            lambda x: x[None], (noisy, Control(camera, actions, control.state_A))
+        )
+        given = world_model.condition(
+            self,
+            params,
+            observed,
+            whole,
+            noise_B=jnp.full((1,), self.image_noise),
+            clean_BTHWC=past.rgb_THWC[None],
+        )
+        blind = None
+        if self.noise.guidance != 1:
+            blind = world_model.blind(self, params, given, np.ones((1,), bool))
+        latents = world_model.draw(self, params, given, None, key, blind=blind)
+        rgb, depth = rgbd.decode_rgbd(self, params, latents)
+        depth = depth if self.clip.depth else jnp.zeros_like(depth)
+        return Frames(rgb[0, self.history :], depth[0, self.history :], control.camera)
+
+    def _state(self, frames: Frames) -> WorldState:
+        """Return the state whose last frames are these: the present one, and those before it."""
+        count = frames.depth_THW.shape[0]
+        kept = np.maximum(np.arange(count - self.history, count), 0)
+        past = jax.tree.map(lambda x: x[kept], frames)
+        return WorldState(
+            jax.tree.map(lambda x: x[-1:], past), jax.tree.map(lambda x: x[:-1], past)
+        )
 
 
-VIDEO = Stage(
-    name="video",
-    number=1,
-    rules=((r"backbone/.*", TRAIN), (r"(control|codec|image|text)/.*", FREEZE)),
-    init=init,
-    loss=loss,
-    prepare=functools.partial(objective.prepare, memory=False),
-    optional=True,
-)
-"""The backbone learns to be a video model: the control stands still, and it begins with zeros."""
-ADAPT = dataclasses.replace(
-    VIDEO,
-    name="adapt",
-    number=2,
-    rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|image|text)/.*", FREEZE)),
-    optional=False,
-)
-"""The whole backbone learns on, with actions."""
-
-
-def stages(model: EgoWMConfig) -> tuple[Stage, ...]:
-    """Return the stages, of which the second has the control's learning rate."""
-    return VIDEO, dataclasses.replace(ADAPT, rates=((r"control/.*", model.control.rate),))
-
-
-def start(model: EgoWMConfig, params: Params, frames: Frames) -> WorldState:
-    """Begin a world; see ``worlds.start``. Of fewer frames than ``history`` the first repeats."""
-    del params
-    pewm.require_frames(model, frames, "start")
-    return _state(model, jax.tree.map(jnp.asarray, as_signal(frames)))
-
-
-def observe(model: EgoWMConfig, params: Params, state: WorldState, frames: Frames) -> WorldState:
-    """Take in real frames; see ``worlds.observe``."""
-    del params
-    pewm.require_frames(model, frames, "observe")
-    return _state(model, _behind(state.map, state.frame, as_signal(frames)))
-
-
-def imagine(
-    model: EgoWMConfig,
-    params: Params,
-    state: WorldState,
-    control: Any,
-    key: Array,
-    *,
-    remember: bool = True,
-    memory: bool = True,
-) -> tuple[WorldState, Frames]:
-    """Imagine chunk after chunk; see ``worlds.imagine``.
-
-    There is no memory to ignore. Without ``remember`` the state keeps the frames before the present
-    one that it had; with a ``history`` of 1 there are none, and the two are the same.
-    """
-    del memory
-    asked = control_of(model, state.frame.camera, control)
-    count = asked.camera.world_from_camera.shape[0]
-    chunked, wanted = cut_into_clips(asked, model.clip.frames - model.history)
-    keys = jax.random.split(key, chunked.camera.world_from_camera.shape[0])
-
-    def step(past: Frames, inputs: tuple[Control, Array, Array | None]) -> tuple[Frames, Frames]:
-        chunk, chunk_key, valid = inputs
-        frames = imagine_chunk(model, params, past, chunk, chunk_key)
-        seen = None if valid is None else valid.sum() + model.history
-        return last_frames(_behind(past, frames), seen, model.history), frames
-
-    past, frames = jax.lax.scan(step, _behind(state.map, state.frame), (chunked, keys, wanted))
-    after = _state(model, past)
-    if not remember:
-        after = WorldState(after.frame, state.map)
-    return after, join_clips(frames, count)
-
-
-def imagine_chunk(
-    model: EgoWMConfig, params: Params, past: Frames, control: Control, key: Array
-) -> Frames:
-    """Imagine one chunk.
-
-    Args:
-        model: the model.
-        params: the world model's parameters.
-        past: (history) frames before it, colours float in [−1, 1]; the last one is the present.
-        control: (n) cameras of the frames to imagine, with n = clip.frames − history, and actions
-            that lead to them.
-        key: randomness of the noise.
-
-    Returns:
-        n frames; depth is 0 where the denoiser works without it (``clip.depth``).
-    """
-    before = model.history - 1
-    actions = control.actions_TA
-    if actions is not None:  # of those that led to the past frames the control makes nothing
-        actions = jnp.pad(actions, ((before, 0), (0, 0)))
-    camera = _behind(past.camera, control.camera)
-    noise_key, key = jax.random.split(key)
-    rgb = past.rgb_THWC
-    if model.image_noise:
-        rgb = rgb + model.image_noise * jax.random.normal(noise_key, rgb.shape)
-    noisy = dataclasses.replace(past, rgb_THWC=rgb)
-    observed, whole = jax.tree.map(
-        lambda x: x[None], (noisy, Control(camera, actions, control.state_A))
-    )
-    given = world_model.condition(
-        model,
-        params,
-        observed,
-        whole,
-        noise_B=jnp.full((1,), model.image_noise),
-        clean_BTHWC=past.rgb_THWC[None],
-    )
-    blind = None
-    if model.noise.guidance != 1:
-        blind = world_model.blind(model, params, given, np.ones((1,), bool))
-    latents = world_model.draw(model, params, given, None, key, blind=blind)
-    rgb, depth = rgbd.decode_rgbd(model, params, latents)
-    depth = depth if model.clip.depth else jnp.zeros_like(depth)
-    return Frames(rgb[0, model.history :], depth[0, model.history :], control.camera)
-
-
-def _state(model: EgoWMConfig, frames: Frames) -> WorldState:
-    """Return the state whose last frames are these: the present one, and those before it."""
-    count = frames.depth_THW.shape[0]
-    kept = np.maximum(np.arange(count - model.history, count), 0)
-    past = jax.tree.map(lambda x: x[kept], frames)
-    return WorldState(jax.tree.map(lambda x: x[-1:], past), jax.tree.map(lambda x: x[:-1], past))
-
-
-def _behind(*parts: Any) -> Any:
+def _joined(*parts: Any) -> Any:
     """Join frames, or cameras, one after the other."""
     return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)

@@ -14,17 +14,18 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import PersistConfig, UserError
+from pewm_jax.config import UserError
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
 from pewm_jax.types import Array, Camera, Clip, Params
 from pewm_jax.worlds.persist import losses
 from pewm_jax.worlds.persist import state as grid_state
+from pewm_jax.worlds.persist.config import PersistModel
 from pewm_jax.worlds.persist.step import drawn
 
 
-def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
+def lattice(model: PersistModel, clip: Clip) -> tuple[Array, Array]:
     """Return where the recorded grids begin, and the windows of their frames, in whole cells.
 
     Windows begin at whole tokens of a lattice. A rollout's lies where its first frame was, so each
@@ -44,11 +45,11 @@ def lattice(model: PersistConfig, clip: Clip) -> tuple[Array, Array]:
     recorded = first + jnp.round((origin - origin[:, :1]) / size).astype(jnp.int32)
     place = jnp.asarray(clip.frames.camera.world_from_camera)[..., :3, 3]
     agent = recorded + jnp.floor((place - origin) / size).astype(jnp.int32)
-    wide, token = grid_state.side(model), model.backbone.token_cells  # type: ignore[attr-defined]
+    wide, token = grid_state.side(model), model.backbone.token_cells
     shift = _mixed(agent[:, :1]) % token
     recorded, agent = recorded + shift, agent + shift
     start = grid_state.snapped(agent - wide // 2, token)
-    beside = (model.memory.recorded - wide) // 2  # type: ignore[attr-defined]
+    beside = (model.memory.recorded - wide) // 2
     return recorded, start.at[..., 2].set(recorded[..., 2] + beside)
 
 
@@ -61,7 +62,7 @@ def _mixed(cell_BT3: Array) -> Array:
     return both.astype(jnp.int32)
 
 
-def cut(model: PersistConfig, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
+def cut(model: PersistModel, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
     """Return (B, T, X, Y, Z) int16 windows of the recorded grids, unknown where they reach out."""
     classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
     one = functools.partial(grid_state.cut, count=grid_state.side(model))
@@ -69,7 +70,7 @@ def cut(model: PersistConfig, clip: Clip, start_BT3: Array, recorded_BT3: Array)
 
 
 def pictures(
-    model: PersistConfig, params: Params, clip: Clip
+    model: PersistModel, params: Params, clip: Clip
 ) -> tuple[Array, grid_state.ShownPicture]:
     """Return (B, T, h, w, C) latents of the frames, and the same as voxel frames are shown them."""
     frames = as_signal(clip.frames)
@@ -79,7 +80,7 @@ def pictures(
     return latents, grid_state.shown_of(latents, jnp.asarray(frames.depth_THW), camera)
 
 
-def grids(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+def grids(model: PersistModel, params: Params, clip: Clip) -> Clip:
     """Return the windows of the first and of the last frame, for the autoencoder."""
     del params
     recorded, start = lattice(model, clip)
@@ -88,14 +89,14 @@ def grids(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     return _prepared(clip, jnp.maximum(cut(model, some, start[:, ends], recorded[:, ends]), 0))
 
 
-def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
     """Return latents of voxel frames, all in the window of the last one, and their conditions."""
     recorded, start = lattice(model, clip)
     last = jnp.broadcast_to(start[:, -1:], start.shape)
     classes = cut(model, clip, last, recorded)
     shape = classes.shape[:2]
     flat = classes.reshape(-1, *classes.shape[2:])
-    config, weights = model.backbone.voxel_vae, params["voxel_vae"]  # type: ignore[attr-defined]
+    config, weights = model.backbone.voxel_vae, params["voxel_vae"]
     dtype = jnp.dtype(model.dtype)
 
     def encode(grid: Array) -> Array:
@@ -104,12 +105,12 @@ def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     latents = jax.lax.map(encode, flat)
     latents = latents.reshape(*shape, *latents.shape[1:])
     recorded_too = jax.vmap(jax.vmap(functools.partial(grid_state.known_latents, model)))(classes)
-    token, wide = model.backbone.token_cells, grid_state.side(model)  # type: ignore[attr-defined]
+    token, wide = model.backbone.token_cells, grid_state.side(model)
     at = last[..., None] + jnp.arange(0, wide, token)  # (B, T, 3, tokens)
     inside = (at >= start[..., None]) & (at < start[..., None] + wide)
     x, y, z = jnp.moveaxis(inside, 2, 0)
     own = x[..., :, None, None] & y[..., None, :, None] & z[..., None, None, :]
-    patch = model.backbone.world_frames.patch  # type: ignore[attr-defined]
+    patch = model.backbone.world_frames.patch
     known = grid_state.spread(own, patch) & recorded_too
 
     corner = jnp.asarray(clip.extras["origin_T3"]) - recorded * grid_state.cell_m(model)
@@ -129,20 +130,20 @@ def frames(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     return _prepared(clip, made)
 
 
-def occupied(model: PersistConfig, classes_BTXYZ: Array) -> Array:
+def occupied(model: PersistModel, classes_BTXYZ: Array) -> Array:
     """Return (B, T, x, y, z) bool: whether anything is known to be in the cells of a latent."""
     *front, wide, _, _ = classes_BTXYZ.shape
-    factor = model.backbone.voxel_vae.factor  # type: ignore[attr-defined]
+    factor = model.backbone.voxel_vae.factor
     count = wide // factor
     cells = (classes_BTXYZ > 0).reshape(*front, count, factor, count, factor, count, factor)
     return cells.any((-5, -3, -1))
 
 
-def cameras(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
     """Return the voxels around where the camera was before each frame, and the cameras."""
     del params
     recorded, _ = lattice(model, clip)
-    size, config = grid_state.cell_m(model), model.backbone.camera_model  # type: ignore[attr-defined]
+    size, config = grid_state.cell_m(model), model.backbone.camera_model
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     place, origin = camera.world_from_camera[..., :3, 3], jnp.asarray(clip.extras["origin_T3"])
     cell = jnp.floor((place - origin) / size).astype(jnp.int32)
@@ -159,7 +160,7 @@ def cameras(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     return _prepared(clip, made)
 
 
-def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
+def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
     """Return latents of the pictures, and what their rays meet in the true voxels."""
     recorded, start = lattice(model, clip)
     classes = jnp.maximum(cut(model, clip, start, recorded), 0)
@@ -170,7 +171,7 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
 
     def look(one: tuple[Array, Array, Camera]) -> RayHits:
         grid, low, seen = one
-        return voxel_renderer.cast_rays(model.backbone.renderer, grid, low, size, seen, pixels)  # type: ignore[attr-defined]
+        return voxel_renderer.cast_rays(model.backbone.renderer, grid, low, size, seen, pixels)
 
     layers = jax.lax.map(look, (classes, corner, camera))
     made = {
@@ -180,7 +181,7 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
         "side": layers.side_L.astype(jnp.int8),
         "actions": losses.led_to(clip.actions_TA),
     }
-    if model.backbone.renderer.drawn:  # type: ignore[attr-defined]
+    if model.backbone.renderer.drawn:
 
         def draw(one: tuple[Array, Array, Camera]) -> Array:
             return jax.lax.map(lambda frame: drawn(model, params, *frame), one)
@@ -189,26 +190,26 @@ def layers(model: PersistConfig, params: Params, clip: Clip) -> Clip:
     return _prepared(clip, made)
 
 
-def require_recorded(model: PersistConfig, clip: Clip) -> None:
+def require_recorded(model: PersistModel, clip: Clip) -> None:
     """Refuse data without what this world learns from.
 
     Raises:
         UserError: no voxels, no actions, or grids of another size.
     """
     memory, classes = model.memory, clip.extras.get("classes_TXYZ")
-    groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"  # type: ignore[attr-defined]
+    groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"
     command = (
         f"pewm-jax data collect DATA --moving --voxels --voxels.cell {grid_state.cell_m(model):g} "
-        f"--voxels.side {memory.recorded} {groups} --voxels.pictures {memory.pictures}"  # type: ignore[attr-defined]
+        f"--voxels.side {memory.recorded} {groups} --voxels.pictures {memory.pictures}"
     )
     if classes is None or clip.actions_TA is None:
         raise UserError(
             f"the data have no voxels or no actions, from which this world learns: {command}."
         )
-    if classes.shape[-1] != memory.recorded:  # type: ignore[attr-defined]
+    if classes.shape[-1] != memory.recorded:
         raise UserError(
             f"the recorded grids have {classes.shape[-1]} cells along each axis, and memory."
-            f"recorded is {memory.recorded}: {command}."  # type: ignore[attr-defined]
+            f"recorded is {memory.recorded}: {command}."
         )
 
 

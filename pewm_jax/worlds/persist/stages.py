@@ -1,7 +1,4 @@
-"""How the world ``persist`` learns: its stages and the loss of each.
-
-What a stage is given of a batch is prepared by ``persist_prepare``.
-"""
+"""The stages of PERSIST's training and the loss of each; ``prepare.py`` prepares their batches."""
 
 from __future__ import annotations
 
@@ -12,12 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import PersistConfig, PersistTrainConfig, TrainSettings
+from pewm_jax.config import TrainSettings
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import nets as persist_nets
 from pewm_jax.models.persist import voxel_vae
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.persist import losses, prepare
+from pewm_jax.worlds.persist.config import PersistModel, PersistTrainConfig
 from pewm_jax.worlds.persist.step import reckoning
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -27,7 +25,7 @@ SMALL = 1e-4
 """The least scale of a latent."""
 
 
-def init(model: PersistConfig, key: Array, networks: int = len(persist_nets.NETWORKS)) -> Params:
+def init(model: PersistModel, key: Array, networks: int = len(persist_nets.NETWORKS)) -> Params:
     """Return random parameters of the codec and of the first so many networks."""
     codec_key, key = jax.random.split(key)
     names = persist_nets.NETWORKS[:networks]
@@ -36,7 +34,7 @@ def init(model: PersistConfig, key: Array, networks: int = len(persist_nets.NETW
 
 
 def _of(
-    prepare: Callable[..., Clip], model: PersistConfig, params: Params, clip: Clip
+    prepare: Callable[..., Clip], model: PersistModel, params: Params, clip: Clip
 ) -> dict[str, Any]:
     """Return what a stage is given of a batch, prepared now if it was not before."""
     if "prepared" not in clip.extras:
@@ -45,23 +43,23 @@ def _of(
 
 
 def autoencode(
-    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+    model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``voxel_vae``."""
     del train
     grids: Any = _of(prepare.grids, model, params, clip)
-    config = model.backbone.voxel_vae  # type: ignore[attr-defined]
+    config = model.backbone.voxel_vae
     dtype = jnp.dtype(model.dtype)
     return losses.voxel_vae(config, params["voxel_vae"], grids.astype(jnp.int32), key, dtype)
 
 
 def distribute(
-    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+    model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``voxel_statistics``: least at mean 0 and variance 1 of latents."""
     del train, key
     grids: Any = _of(prepare.grids, model, params, clip)
-    config, weights = model.backbone.voxel_vae, params["voxel_vae"]  # type: ignore[attr-defined]
+    config, weights = model.backbone.voxel_vae, params["voxel_vae"]
     grids = grids.reshape(-1, *grids.shape[2:]).astype(jnp.int32)
     mean, _ = voxel_vae.moments(config, weights, grids, jnp.dtype(model.dtype))
     scale = jnp.abs(weights["latent_scale_C"]) + SMALL
@@ -74,15 +72,15 @@ def distribute(
 
 
 def world_frames(
-    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+    model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``world_frames``."""
     assert isinstance(train, PersistTrainConfig)
     made = _of(prepare.frames, model, params, clip)
-    config = model.backbone.world_frames  # type: ignore[attr-defined]
+    config = model.backbone.world_frames
 
     def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
-        vae, cells = model.backbone.voxel_vae, made["classes"]  # type: ignore[attr-defined]
+        vae, cells = model.backbone.voxel_vae, made["classes"]
         frozen = params["voxel_vae"]
         error, right = losses.compared(vae, frozen, x0, cells, weight, train.compared, key)
         return train.classes * error, right
@@ -105,13 +103,13 @@ def world_frames(
 
 
 def camera(
-    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+    model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``camera``."""
     del train, key
     made = _of(prepare.cameras, model, params, clip)
     return losses.camera(
-        model.backbone.camera_model,  # type: ignore[attr-defined]
+        model.backbone.camera_model,
         params["camera_model"],
         made["classes"].astype(jnp.int32),
         made["middle"],
@@ -124,12 +122,12 @@ def camera(
 
 
 def renderer(
-    model: PersistConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+    model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``renderer``."""
     del train
     made = _of(prepare.layers, model, params, clip)
-    config = model.backbone.renderer  # type: ignore[attr-defined]
+    config = model.backbone.renderer
     layers = RayHits(
         made["ids"].astype(jnp.int32),
         made["distance"].astype(jnp.float32),

@@ -14,11 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs import rgbd
-from pewm_jax.config import POINT_WAVES, Noise, PersistConfig
+from pewm_jax.config import Noise
 from pewm_jax.geometry.cameras import resize_intrinsics, unproject
 from pewm_jax.memory.class_grid import UNKNOWN, ClassGrid
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.types import Array, Camera, Params
+from pewm_jax.worlds.persist.config import POINT_WAVES, PersistModel
 
 LONGEST_M, SHORTEST_M = 24.0, 1.5
 """Wavelengths of the sinusoids of a place, metres."""
@@ -40,17 +41,17 @@ class ShownPicture:
     camera: Camera
 
 
-def cell_m(model: PersistConfig) -> float:
+def cell_m(model: PersistModel) -> float:
     """Return the side of a cell, metres."""
     return model.memory.cell_m[0]
 
 
-def side(model: PersistConfig) -> int:
+def side(model: PersistModel) -> int:
     """Return the cells along an axis of a window."""
-    return model.backbone.voxel_vae.side  # type: ignore[attr-defined]
+    return model.backbone.voxel_vae.side
 
 
-def first_cell(model: PersistConfig, low_3: Array, position_3: Array) -> Array:
+def first_cell(model: PersistModel, low_3: Array, position_3: Array) -> Array:
     """Return the first cell (3,) of the window around a position, in a world's grid.
 
     Args:
@@ -58,7 +59,7 @@ def first_cell(model: PersistConfig, low_3: Array, position_3: Array) -> Array:
         low_3: lowest corner of the world's grid, metres.
         position_3: the agent's camera, metres.
     """
-    token, wide = model.backbone.token_cells, side(model)  # type: ignore[attr-defined]
+    token, wide = model.backbone.token_cells, side(model)
     cell = jnp.floor((position_3 - low_3) / cell_m(model)).astype(jnp.int32)
     start = snapped(cell - wide // 2, token)
     most = np.asarray(model.memory.cells) - wide
@@ -70,7 +71,7 @@ def snapped(cell: Array, token: int) -> Array:
     return (cell + token // 2) // token * token
 
 
-def window(model: PersistConfig, classes_XYZ: Array, start_3: Array) -> Array:
+def window(model: PersistModel, classes_XYZ: Array, start_3: Array) -> Array:
     """Return the cells of a window."""
     return jax.lax.dynamic_slice(classes_XYZ, tuple(start_3), (side(model),) * 3)
 
@@ -93,10 +94,10 @@ def cut(classes_XYZ: Array, start_3: Array, count: int) -> Array:
     return classes_XYZ
 
 
-def known_latents(model: PersistConfig, classes_XYZ: Array) -> Array:
+def known_latents(model: PersistModel, classes_XYZ: Array) -> Array:
     """Return (x, y, z) bool: the latents of whose token all cells are known."""
-    token, wide = model.backbone.token_cells, side(model)  # type: ignore[attr-defined]
-    patch, count = model.backbone.world_frames.patch, wide // token  # type: ignore[attr-defined]
+    token, wide = model.backbone.token_cells, side(model)
+    patch, count = model.backbone.world_frames.patch, wide // token
     known = (classes_XYZ != UNKNOWN).reshape(count, token, count, token, count, token)
     return spread(known.all((1, 3, 5)), patch)
 
@@ -108,9 +109,9 @@ def spread(known_xyz: Array, patch: int) -> Array:
     return known_xyz
 
 
-def moved(model: PersistConfig, cache: FrameCache, before_3: Array, after_3: Array) -> FrameCache:
+def moved(model: PersistModel, cache: FrameCache, before_3: Array, after_3: Array) -> FrameCache:
     """Return what is kept of voxel frames for a window that has moved; nothing of new cells."""
-    token = model.backbone.token_cells  # type: ignore[attr-defined]
+    token = model.backbone.token_cells
     count = side(model) // token
     tokens = (after_3 - before_3) // token
     places = np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)
@@ -143,7 +144,7 @@ def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> ShownPictur
     return ShownPicture(latents_hwC, mean, camera)
 
 
-def picture_channels(model: PersistConfig, shown: ShownPicture, middle_3: Array) -> Array:
+def picture_channels(model: PersistModel, shown: ShownPicture, middle_3: Array) -> Array:
     """Return the channels of pictures as voxel frames are shown them, (..., h, w, C).
 
     Args:
@@ -167,7 +168,7 @@ def picture_channels(model: PersistConfig, shown: ShownPicture, middle_3: Array)
     return jnp.concatenate([shown.latents_hwC, waves], -1)
 
 
-def middle(model: PersistConfig, low_3: Array, start_3: Array) -> Array:
+def middle(model: PersistModel, low_3: Array, start_3: Array) -> Array:
     """Return the middle (3,) of the window that begins at a cell, metres."""
     return low_3 + (start_3 + side(model) / 2) * cell_m(model)
 
@@ -231,13 +232,13 @@ class KnownFrame:
     start_3: Array | None = None
 
 
-def encoded(model: PersistConfig, params: Params, rgb_HWC: Array, depth_HW: Array) -> Array:
+def encoded(model: PersistModel, params: Params, rgb_HWC: Array, depth_HW: Array) -> Array:
     """Return the latents (h, w, C) of a picture: those of its depth with them, if it has any."""
     both = rgbd.encode_rgbd(model, params, rgb_HWC[None, None], depth_HW[None, None])
     return both[0, 0, ..., : model.picture_channels]
 
 
-def decoded(model: PersistConfig, params: Params, latents_hwC: Array) -> tuple[Array, Array]:
+def decoded(model: PersistModel, params: Params, latents_hwC: Array) -> tuple[Array, Array]:
     """Return colours (H, W, 3) and depth (H, W) of a picture's latents; depth 0 without any."""
     missing = model.codec.channels - latents_hwC.shape[-1]
     latents = jnp.pad(latents_hwC, ((0, 0), (0, 0), (0, missing)))

@@ -10,7 +10,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.config import PersistConfig
 from pewm_jax.geometry.actions import (
     CAMERA_STEP_NUMBERS,
     camera_numbers,
@@ -23,18 +22,19 @@ from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.types import Array, Camera, Frames, Params
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist import voxel_frames
+from pewm_jax.worlds.persist.config import PersistModel
 from pewm_jax.worlds.persist.state import History, KnownFrame, Past, context, decoded, encoded
 from pewm_jax.worlds.persist.voxel_frames import ObservedCells
 
 
-def reckoned(model: PersistConfig, here: Camera, action_A: Array) -> Camera:
+def reckoned(model: PersistModel, here: Camera, action_A: Array) -> Camera:
     """Return about where an action leads, to lay the window there: planar ones alone say."""
     if model.control.actions != 3:
         return here
     return Camera(here.intrinsics_4, step_pose(here.world_from_camera, action_A))
 
 
-def reckoning(model: PersistConfig, actions_A: Array) -> Array:
+def reckoning(model: PersistModel, actions_A: Array) -> Array:
     """Return the steps (..., 6) to which the camera model adds what it says."""
     if not model.dead_reckoning:
         return jnp.zeros((*actions_A.shape[:-1], CAMERA_STEP_NUMBERS))
@@ -44,7 +44,7 @@ def reckoning(model: PersistConfig, actions_A: Array) -> Array:
 
 
 def next_camera(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     classes_XYZ: Array,
     low_3: Array,
@@ -53,7 +53,7 @@ def next_camera(
     cache: FrameCache,
 ) -> tuple[Camera, FrameCache]:
     """Return where the camera goes, given the voxels around where it is."""
-    config = model.backbone.camera_model  # type: ignore[attr-defined]
+    config = model.backbone.camera_model
     place, size = here.world_from_camera[:3, 3], grid_state.cell_m(model)
     cell = jnp.floor((place - low_3) / size).astype(jnp.int32)
     inner = grid_state.cut(classes_XYZ, cell - config.inner // 2, config.inner)
@@ -72,7 +72,7 @@ def next_camera(
 
 
 def features(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     classes_XYZ: Array,
     low_3: Array,
@@ -80,7 +80,7 @@ def features(
     camera: Camera,
 ) -> Array:
     """Return what the camera sees of a window, (1, 1, h, w, F); no gradient goes through rays."""
-    config = model.backbone.renderer  # type: ignore[attr-defined]
+    config = model.backbone.renderer
     camera = jax.lax.stop_gradient(camera)
     corner = low_3 + start_3 * grid_state.cell_m(model)
     layers = voxel_renderer.cast_rays(
@@ -101,7 +101,7 @@ def features(
 
 
 def drawn(
-    model: PersistConfig, params: Params, classes_XYZ: Array, corner_3: Array, camera: Camera
+    model: PersistModel, params: Params, classes_XYZ: Array, corner_3: Array, camera: Camera
 ) -> Array:
     """Return latents (h, w, C) of a window drawn in the colours of its classes, without light.
 
@@ -120,7 +120,7 @@ def drawn(
 
 
 def sample(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     features: Array,
     action_A: Array,
@@ -128,7 +128,7 @@ def sample(
     key: Array,
 ) -> Array:
     """Sample the latents (h, w, C) of a picture of the voxels."""
-    config, noise = model.backbone.renderer, model.noise  # type: ignore[attr-defined]
+    config, noise = model.backbone.renderer, model.noise
     shape = (1, 1, config.height, config.width, config.latent_channels)
 
     def denoise(x: Array, time_B: Array, weight: Array) -> Array:
@@ -141,7 +141,7 @@ def sample(
 
 
 def remembered(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     latents_hwC: Array,
     features: Array,
@@ -155,7 +155,7 @@ def remembered(
 
 
 def _render(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     x: Array,
     times_BT: Array,
@@ -163,7 +163,7 @@ def _render(
     action_A: Array,
     cache: FrameCache,
 ) -> tuple[Array, FrameCache]:
-    config, noise = model.backbone.renderer, model.noise  # type: ignore[attr-defined]
+    config, noise = model.backbone.renderer, model.noise
     inputs, network_times = noise.precondition(x, times_BT)
     return voxel_renderer.apply(
         config,
@@ -177,7 +177,7 @@ def _render(
 
 
 def begin(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     grid: ClassGrid,
     frame: Frames,
@@ -202,9 +202,9 @@ def begin(
     dtype = jnp.dtype(model.dtype)
     start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
     history = History(
-        voxel_dit.empty_cache(nets.world_frames, 1, dtype),  # type: ignore[attr-defined]
-        camera_model.empty_cache(nets.camera_model, 1, dtype),  # type: ignore[attr-defined]
-        voxel_renderer.empty_cache(nets.renderer, 1, dtype),  # type: ignore[attr-defined]
+        voxel_dit.empty_cache(nets.world_frames, 1, dtype),
+        camera_model.empty_cache(nets.camera_model, 1, dtype),
+        voxel_renderer.empty_cache(nets.renderer, 1, dtype),
         jnp.zeros((model.control.actions,)),
         shown,
         start,
@@ -229,7 +229,7 @@ def begin(
 
 
 def step(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     past: Past,
     action_A: Array,
@@ -294,7 +294,7 @@ def step(
 
 
 def _sight(
-    model: PersistConfig,
+    model: PersistModel,
     grid: ClassGrid,
     start_3: Array,
     rgb_HWC: Array,

@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import PersistConfig
 from pewm_jax.data.voxels import PALETTE
 from pewm_jax.geometry import block_light
 from pewm_jax.geometry.actions import camera_numbers
@@ -31,11 +30,12 @@ from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.nn.layers import linear
 from pewm_jax.types import Array, Camera, Params
 from pewm_jax.worlds.persist import state as grid_state
+from pewm_jax.worlds.persist.config import PersistModel
 from pewm_jax.worlds.persist.state import History, context
 
 
 def sample(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     history: History,
     cache: FrameCache,
@@ -57,7 +57,7 @@ def sample(
         key: randomness.
         evidence: what a real picture of this frame shows of the window's cells.
     """
-    config, noise = model.backbone.world_frames, model.voxel_noise  # type: ignore[attr-defined]
+    config, noise = model.backbone.world_frames, model.voxel_noise
     asked = _asked(model, history, middle_3)
     shape = (1, 1, *(config.latent_side,) * 3, config.latent_channels)
 
@@ -76,7 +76,7 @@ def sample(
 
 
 def decode_classes(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     latents_BxyzC: Array,
     before_XYZ: Array,
@@ -89,7 +89,7 @@ def decode_classes(
     ``model.empty_prior``. ``model.observation_logit`` is added to the class that a real picture
     shows.
     """
-    config = model.backbone.voxel_vae  # type: ignore[attr-defined]
+    config = model.backbone.voxel_vae
     weights, dtype = params["voxel_vae"], jnp.dtype(model.dtype)
     looked = evidence is not None and model.observation_logit > 0
     if not model.persistence_logit and not model.empty_prior and not looked:
@@ -113,7 +113,7 @@ def decode_classes(
 
 
 def taken_in(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     history: History,
     cache: FrameCache,
@@ -122,8 +122,8 @@ def taken_in(
     key: Array,
 ) -> FrameCache:
     """Encode the present voxels and add them to the cache; what is not known of them is noise."""
-    config, noise = model.backbone.world_frames, model.voxel_noise  # type: ignore[attr-defined]
-    vae, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)  # type: ignore[attr-defined]
+    config, noise = model.backbone.world_frames, model.voxel_noise
+    vae, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)
     known = grid_state.known_latents(model, classes_XYZ)
     ids = jnp.maximum(classes_XYZ, 0).astype(jnp.int32)
     latents = voxel_vae.encode(vae, params["voxel_vae"], ids[None], dtype)[:, None]
@@ -143,9 +143,9 @@ def taken_in(
     return cache
 
 
-def _asked(model: PersistConfig, history: History, middle_3: Array) -> dict[str, Any]:
+def _asked(model: PersistModel, history: History, middle_3: Array) -> dict[str, Any]:
     """Return the transformer's condition of one voxel frame."""
-    config, shown = model.backbone.world_frames, history.shown  # type: ignore[attr-defined]
+    config, shown = model.backbone.world_frames, history.shown
     channels = grid_state.picture_channels(model, shown, middle_3)
     camera = camera_numbers(shown.camera, model.clip.width, middle_3)
     return {
@@ -177,17 +177,17 @@ class ObservedCells:
     colour_XYZ: Array
 
 
-def advantage(model: PersistConfig, evidence: ObservedCells, classes: int) -> Array:
+def advantage(model: PersistModel, evidence: ObservedCells, classes: int) -> Array:
     """Return the nats (X, Y, Z, classes) that sight adds to the scores of classes."""
     number = jnp.arange(classes)
-    colours = model.memory.colours  # type: ignore[attr-defined]
+    colours = model.memory.colours
     air = evidence.air_XYZ[..., None] & (number == 0)
     surface = (number > 0) & ((number - 1) % colours == evidence.colour_XYZ[..., None])
     return model.observation_logit * (air | surface)
 
 
 def seen(
-    model: PersistConfig, corner_3: Array, rgb_HWC: Array, depth_HW: Array, camera: Camera
+    model: PersistModel, corner_3: Array, rgb_HWC: Array, depth_HW: Array, camera: Camera
 ) -> ObservedCells:
     """Return what a picture shows of a window's cells.
 
@@ -215,7 +215,7 @@ def seen(
     ones = jnp.ones(depth_HW.shape)
     lit = block_light.light(surface, corner_3, size, eye, way_HW3, ones, borders)
     colour_HW = _nearest(model, (rgb_HWC + 1) / 2 / lit[..., None])
-    colours = model.memory.colours  # type: ignore[attr-defined]
+    colours = model.memory.colours
     votes = jnp.zeros((side**3 + 1, colours), jnp.int32)
     votes = votes.at[cell, colour_HW.reshape(-1)].add(1)[:-1]
     colour = votes.argmax(-1).reshape((side,) * 3).astype(jnp.int32)
@@ -223,7 +223,7 @@ def seen(
     return ObservedCells(air, jnp.where(surface, colour, -1))
 
 
-def _before(model: PersistConfig, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
+def _before(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
     """Return which cells (X, Y, Z) lie before what was measured in their direction."""
     size, side = grid_state.cell_m(model), grid_state.side(model)
     steps = (np.arange(side) + 0.5) * size
@@ -239,8 +239,8 @@ def _before(model: PersistConfig, corner_3: Array, depth_HW: Array, camera: Came
     return within & (place[..., 2] > NEAREST_M) & (place[..., 2] + size / 2 < measured)
 
 
-def _nearest(model: PersistConfig, rgb_HW3: Array) -> Array:
+def _nearest(model: PersistModel, rgb_HW3: Array) -> Array:
     """Return the number of the nearest colour of the palette, (H, W)."""
-    count = model.memory.colours  # type: ignore[attr-defined]
+    count = model.memory.colours
     palette = np.array(list(PALETTE.values())[:count], np.float32) / 255
     return jnp.square(rgb_HW3[..., None, :] - palette).sum(-1).argmin(-1)

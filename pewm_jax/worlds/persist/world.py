@@ -20,61 +20,120 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import PersistConfig, UserError
+from pewm_jax.config import UserError, register
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import class_grid
+from pewm_jax.memory import interface as memories
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import checks
 from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.persist import stages as persist_stages
 from pewm_jax.worlds.persist import state as grid_state
+from pewm_jax.worlds.persist.config import PersistModel
 from pewm_jax.worlds.persist.state import KnownFrame, Past, encoded
 from pewm_jax.worlds.persist.step import begin, step
-from pewm_jax.worlds.pewm import world as pewm
 from pewm_jax.worlds.stages import Stage
 
-memory_points, point_colours = pewm.memory_points, pewm.point_colours
-erase, move = pewm.erase, pewm.move
-init = persist_stages.init
 START = 0
 """Seed of the noise from which the voxels of real frames are made."""
 
 
-def stages(model: PersistConfig) -> tuple[Stage, ...]:
-    """Return the stages."""
-    del model
-    return persist_stages.STAGES
+@register("world", "persist")
+@dataclasses.dataclass(frozen=True)
+class PERSIST(PersistModel):
+    """A world that is three-dimensional itself (PERSIST, arXiv 2603.03482)."""
 
+    def init(self, key: Array) -> Params:
+        """Return random parameters of the codec and of the four networks."""
+        return persist_stages.init(self, key)
 
-def sharding(model: PersistConfig) -> tuple[tuple[str, Any], ...]:
-    """Return the rules of the four networks and of the codec."""
-    return (*model.backbone.SHARDING, *model.codec.SHARDING)
+    def stages(self) -> tuple[Stage, ...]:
+        """Return the stages."""
+        return persist_stages.STAGES
 
+    def sharding(self) -> tuple[tuple[str, Any], ...]:
+        """Return the rules of the four networks and of the codec."""
+        return (*self.backbone.SHARDING, *self.codec.SHARDING)
 
-def split_heads(model: PersistConfig, stage: Stage) -> dict[str, int]:
-    """Return the head counts that ``train.mesh.tensor`` must divide."""
-    nets: Any = model.backbone
-    heads = {
-        "world_frames": {"backbone.world_frames.blocks.heads": nets.world_frames.blocks.heads},
-        "camera": {"backbone.camera_model.blocks.heads": nets.camera_model.blocks.heads},
-        "renderer": {"backbone.renderer.blocks.heads": nets.renderer.blocks.heads},
-    }
-    return heads.get(stage.name, {})
+    def split_heads(self, stage: Stage) -> dict[str, int]:
+        """Return the head counts that ``train.mesh.tensor`` must divide."""
+        nets = self.backbone
+        heads = {
+            "world_frames": {"backbone.world_frames.blocks.heads": nets.world_frames.blocks.heads},
+            "camera": {"backbone.camera_model.blocks.heads": nets.camera_model.blocks.heads},
+            "renderer": {"backbone.renderer.blocks.heads": nets.renderer.blocks.heads},
+        }
+        return heads.get(stage.name, {})
 
+    def start(self, params: Params, frames: Frames) -> WorldState:
+        """Begin a world; see ``worlds.start``.
 
-def start(model: PersistConfig, params: Params, frames: Frames) -> WorldState:
-    """Begin a world; see ``worlds.start``.
+        The voxels around the first frame are generated from its picture. Each later frame advances
+        them by one step with the real picture.
+        """
+        checks.require_frames(self, frames, "start")
+        return _from_nothing(self, params, frames)
 
-    The voxels around the first frame are generated from its picture; each later frame carries them
-    on, seen as it really was.
-    """
-    pewm.require_frames(model, frames, "start")
-    return _from_nothing(model, params, frames)
+    def observe(self, params: Params, state: WorldState, frames: Frames) -> WorldState:
+        """Observe real frames; see ``worlds.observe``."""
+        checks.require_frames(self, frames, "observe")
+        params, frames = _arrays(params, as_signal(frames))
+        return _observed(self, params, past_of(self, params, state), frames)
+
+    def imagine(
+        self,
+        params: Params,
+        state: WorldState,
+        control: Any,
+        key: Array,
+        *,
+        remember: bool = True,
+        memory: bool = True,
+    ) -> tuple[WorldState, Frames]:
+        """Imagine frame after frame; see ``worlds.imagine``.
+
+        Without ``memory`` the voxels are generated anew from the present picture, and the state
+        keeps its grid.
+        """
+        params = _arrays(params)[0]
+        asked, steered = _asked(self, state.frame.camera, control)
+        begun = state if memory else _from_nothing(self, params, state.frame, real=False)
+        past = past_of(self, params, begun)
+
+        def one(past: Past, inputs: tuple[Array, Camera, Array]) -> tuple[Past, Frames]:
+            action, camera, frame_key = inputs
+            known = None if steered else KnownFrame(camera=camera)
+            return step(self, params, past, action, frame_key, known)
+
+        keys = jax.random.split(key, asked.camera.intrinsics_4.shape[0])
+        after, frames = jax.lax.scan(one, past, (asked.actions_TA, asked.camera, keys))
+        frames = jax.tree.map(lambda x: x[:, 0], frames)
+        last = jax.tree.map(lambda x: x[-1:], frames)
+        return WorldState(last, after.grid if remember and memory else state.map), frames
+
+    def erase(self, params: Params, state: WorldState, box_23: Array) -> WorldState:
+        """Erase a box from the grid and the present frame; see ``World.erase``."""
+        del params
+        return memories.edited(self, state, self.memory.erase(self, state.map, box_23))
+
+    def move(
+        self,
+        params: Params,
+        state: WorldState,
+        box_23: Array,
+        transform: Array,
+        *,
+        leave: bool = False,
+    ) -> WorldState:
+        """Move the content of a box in the grid and the present frame; see ``World.move``."""
+        del params
+        changed = self.memory.move(self, state.map, box_23, transform, leave=leave)
+        return memories.edited(self, state, changed)
 
 
 def start_in(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     frames: Frames,
     classes_XYZ: Array,
@@ -102,7 +161,7 @@ def start_in(
 
 @functools.partial(jax.jit, static_argnums=0, inline=True)
 def _start_in(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     frames: Frames,
     classes_XYZ: Array,
@@ -110,7 +169,7 @@ def _start_in(
     depth_scale: Array | None,
 ) -> WorldState:
     frames = checks.in_metres(frames, depth_scale)
-    pewm.require_frames(model, frames, "start_in")
+    checks.require_frames(model, frames, "start_in")
     if jnp.ndim(classes_XYZ) != 3 or jnp.shape(origin_3) != (3,):
         raise UserError(
             f"start_in() got cells of shape {jnp.shape(classes_XYZ)} from {jnp.shape(origin_3)}: "
@@ -125,45 +184,6 @@ def _start_in(
     given = jnp.asarray(classes_XYZ).astype(jnp.int16)
     cells = _pasted(empty.classes_XYZ, given, -off.astype(jnp.int32))
     return _started(model, params, ClassGrid(cells, low), frames)
-
-
-def observe(model: PersistConfig, params: Params, state: WorldState, frames: Frames) -> WorldState:
-    """Take in real frames; see ``worlds.observe``."""
-    pewm.require_frames(model, frames, "observe")
-    params, frames = _arrays(params, as_signal(frames))
-    return _observed(model, params, past_of(model, params, state), frames)
-
-
-def imagine(
-    model: PersistConfig,
-    params: Params,
-    state: WorldState,
-    control: Any,
-    key: Array,
-    *,
-    remember: bool = True,
-    memory: bool = True,
-) -> tuple[WorldState, Frames]:
-    """Imagine frame after frame; see ``worlds.imagine``.
-
-    Without ``memory`` the voxels are generated anew from the present picture, and what is in the
-    state is left as it is.
-    """
-    params = _arrays(params)[0]
-    asked, steered = _asked(model, state.frame.camera, control)
-    begun = state if memory else _from_nothing(model, params, state.frame, real=False)
-    past = past_of(model, params, begun)
-
-    def one(past: Past, inputs: tuple[Array, Camera, Array]) -> tuple[Past, Frames]:
-        action, camera, frame_key = inputs
-        known = None if steered else KnownFrame(camera=camera)
-        return step(model, params, past, action, frame_key, known)
-
-    keys = jax.random.split(key, asked.camera.intrinsics_4.shape[0])
-    after, frames = jax.lax.scan(one, past, (asked.actions_TA, asked.camera, keys))
-    frames = jax.tree.map(lambda x: x[:, 0], frames)
-    last = jax.tree.map(lambda x: x[-1:], frames)
-    return WorldState(last, after.grid if remember and memory else state.map), frames
 
 
 def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -> WorldState:
@@ -189,7 +209,7 @@ def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -
 
 @functools.partial(jax.jit, static_argnums=0, inline=True)
 def render_true(
-    model: PersistConfig,
+    model: PersistModel,
     params: Params,
     state: WorldState,
     control: Any,
@@ -228,7 +248,7 @@ def render_true(
     return WorldState(jax.tree.map(lambda x: x[-1:], frames), after.grid), frames
 
 
-def past_of(model: PersistConfig, params: Params, state: WorldState) -> Past:
+def past_of(model: PersistModel, params: Params, state: WorldState) -> Past:
     """Return what a step needs of a state."""
     frame = state.frame
     latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
@@ -242,7 +262,7 @@ def _arrays(*trees: Any) -> Any:
 
 
 def _from_nothing(
-    model: PersistConfig, params: Params, frames: Frames, *, real: bool = True
+    model: PersistModel, params: Params, frames: Frames, *, real: bool = True
 ) -> WorldState:
     """Return a world of which nothing but frames is known."""
     params, frames = _arrays(params, as_signal(frames))
@@ -251,7 +271,7 @@ def _from_nothing(
 
 
 def _started(
-    model: PersistConfig, params: Params, grid: ClassGrid, frames: Frames, *, real: bool = True
+    model: PersistModel, params: Params, grid: ClassGrid, frames: Frames, *, real: bool = True
 ) -> WorldState:
     first, later = (jax.tree.map(lambda x, c=c: x[c], frames) for c in (slice(1), slice(1, None)))
     key = jax.random.key(START)
@@ -261,7 +281,7 @@ def _started(
     return _observed(model, params, past, later)
 
 
-def _observed(model: PersistConfig, params: Params, past: Past, frames: Frames) -> WorldState:
+def _observed(model: PersistModel, params: Params, past: Past, frames: Frames) -> WorldState:
     """Carry the voxels on along real frames."""
     count = frames.depth_THW.shape[0]
     here = past.shown.camera.world_from_camera[None]
@@ -278,14 +298,14 @@ def _observed(model: PersistConfig, params: Params, past: Past, frames: Frames) 
     return WorldState(jax.tree.map(lambda x: x[-1:], frames), past.grid)
 
 
-def _between(model: PersistConfig, poses: Array) -> Array:
+def _between(model: PersistModel, poses: Array) -> Array:
     """Return the actions between cameras; where they are not planar nobody knows them: zeros."""
     if model.control.actions == action_geometry.PLANAR:
         return action_geometry.actions_between(poses)
     return jnp.zeros((len(poses) - 1, model.control.actions))
 
 
-def _asked(model: PersistConfig, present: Camera, control: Any) -> tuple[Control, bool]:
+def _asked(model: PersistModel, present: Camera, control: Any) -> tuple[Control, bool]:
     """Return cameras and actions of the frames to imagine, and whether actions alone steer."""
     planar = model.control.actions == action_geometry.PLANAR
     if isinstance(control, Camera) and planar:

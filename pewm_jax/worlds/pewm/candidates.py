@@ -23,62 +23,29 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs import rgbd
-from pewm_jax.config import ModelConfig
+from pewm_jax.config import AssembledModel
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params, View, WorldState
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.control import control_of
 
 
-def imagine_many(
-    model: ModelConfig,
-    params: Params,
-    state: WorldState,
-    controls: Any,
-    keys: Array,
-    *,
-    memory: bool = True,
-    last: bool = False,
-    views: View | None = None,
-) -> tuple[WorldState, Frames]:
-    """Imagine K candidates; see ``worlds.imagine_many``. ``views`` is of ``Views``."""
-    asked = jax.vmap(lambda control: control_of(model, state.frame.camera, control))(controls)
-    length = model.clip.frames - 1
-    count = asked.camera.world_from_camera.shape[1]
-    clips = -(-count // length)
-    keys_KC = jax.vmap(lambda key: jax.random.split(key, clips))(keys)
-    present, shared, made = state.frame, True, []
-    for number in range(clips):
-        here = slice(number * length, min((number + 1) * length, count))
-        wanted = here.stop - here.start
-        chunk = Control(jax.tree.map(lambda x, s=here: _filled(x[:, s], length), asked.camera))
-        if asked.actions_TA is not None:
-            rest = [(0, 0), (0, length - wanted), (0, 0)]
-            agent = asked.state_A
-            if agent is not None and number:
-                agent = asked.actions_TA[:, here.start - 1]
-            chunk = Control(chunk.camera, jnp.pad(asked.actions_TA[:, here], rest), agent)
-        frames = _clip(
-            model,
-            params,
-            (present, shared),
-            state.map,
-            chunk,
-            keys_KC[:, number],
-            shown=slice(wanted - 1, wanted) if last else slice(0, wanted),
-            memory=memory,
-            view=None if views is None else jax.tree.map(lambda x, n=number: x[:, n], views),
-        )
-        made.append(frames)
-        present, shared = jax.tree.map(lambda x: x[:, -1:], frames), False
-    made = made[-1:] if last else made
-    frames = jax.tree.map(lambda *x: jnp.concatenate(x, 1), *made)
-    return WorldState(present, state.map), frames
+def clip_control(asked: Control, here: slice, length: int) -> Control:
+    """Return the control of one clip of every candidate.
 
-
-def to_compare(model: ModelConfig, state: WorldState) -> WorldState:
-    """Return a state whose memory has no more room than it needs; see ``worlds.to_compare``."""
-    return WorldState(state.frame, model.memory.trimmed(state.map))
+    Args:
+        asked: (K, n) cameras and actions of all frames to imagine.
+        here: the clip's frames among them.
+        length: frames that a clip imagines; where fewer were asked for, the agent stands still.
+    """
+    chunk = Control(jax.tree.map(lambda x: _filled(x[:, here], length), asked.camera))
+    if asked.actions_TA is None:
+        return chunk
+    rest = [(0, 0), (0, length - (here.stop - here.start)), (0, 0)]
+    agent = asked.state_A
+    if agent is not None and here.start:
+        agent = asked.actions_TA[:, here.start - 1]
+    return Control(chunk.camera, jnp.pad(asked.actions_TA[:, here], rest), agent)
 
 
 def _filled(x_KT: Array, length: int) -> Array:
@@ -87,8 +54,8 @@ def _filled(x_KT: Array, length: int) -> Array:
     return jnp.concatenate([x_KT, jnp.repeat(x_KT[:, -1:], missing, 1)], 1) if missing else x_KT
 
 
-def _clip(
-    model: ModelConfig,
+def imagine_clip(
+    model: AssembledModel,
     params: Params,
     present: tuple[Frames, bool],
     remembered: Any,
@@ -156,7 +123,7 @@ def _clip(
 
 
 def look(
-    model: ModelConfig, remembered: Any, camera: Camera, params: Params, view: View | None = None
+    model: AssembledModel, remembered: Any, camera: Camera, params: Params, view: View | None = None
 ) -> MemoryReadout:
     """Return what a memory shows K clips, leading axis K; see ``memory.interface.readout``.
 
@@ -231,7 +198,7 @@ class Views:
         state: the world whose memory is looked at.
     """
 
-    def __init__(self, model: ModelConfig, state: WorldState):
+    def __init__(self, model: AssembledModel, state: WorldState):
         self.model, self.state = model, state
         self.rendered = 0
         self._known: dict[bytes, list[np.ndarray]] = {}
@@ -266,15 +233,6 @@ class Views:
         self.rendered += len(names)
 
 
-def views(model: ModelConfig, params: Params, state: WorldState) -> Views | None:
-    """Return what renders a world's memory for candidates; None if its model looks at no picture.
-
-    See ``worlds.views``.
-    """
-    pictures = memories.gated(model) or model.memory.reader.READS_VIEW
-    return Views(model, state) if pictures and "memory" in params else None
-
-
 def _flat(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Return the intrinsics and the poses of all cameras."""
     return camera.intrinsics_4.reshape(-1, 4), camera.world_from_camera.reshape(-1, 4, 4)
@@ -285,7 +243,7 @@ def _rounded(x: np.ndarray) -> np.ndarray:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _rendered(model: ModelConfig, memory: Any, camera: Camera, count: Array) -> View:
+def _rendered(model: AssembledModel, memory: Any, camera: Camera, count: Array) -> View:
     """Render the first ``count`` of (n,) cameras one after the other; the other views are 0."""
 
     def render(number: Array) -> View:
@@ -303,7 +261,7 @@ def _rendered(model: ModelConfig, memory: Any, camera: Camera, count: Array) -> 
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _cameras(model: ModelConfig, present: Camera, controls: Any) -> Camera:
+def _cameras(model: AssembledModel, present: Camera, controls: Any) -> Camera:
     """Return (K, clips, T) cameras: of each clip the present one, and those that follow."""
     asked = jax.vmap(lambda control: control_of(model, present, control).camera)(controls)
     length = model.clip.frames - 1

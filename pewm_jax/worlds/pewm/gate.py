@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_depth
-from pewm_jax.config import ModelConfig, TrainConfig, TrainSettings, UserError
+from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError
 from pewm_jax.memory import interface as memories
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
@@ -24,7 +24,7 @@ from pewm_jax.worlds import codec as codec_task
 from pewm_jax.worlds import objective, world_model
 
 
-def require_gate(model: ModelConfig) -> None:
+def require_gate(model: AssembledModel) -> None:
     """Refuse a model in which there is nothing to learn.
 
     Raises:
@@ -38,7 +38,7 @@ def require_gate(model: ModelConfig) -> None:
         )
 
 
-def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
+def prepare(model: AssembledModel, params: Params, clip: Clip) -> Clip:
     """Imagine a batch of clips with their memories; ``latents_thwC`` are those imagined.
 
     The noise depends on the clips alone.
@@ -67,7 +67,7 @@ def prepare(model: ModelConfig, params: Params, clip: Clip) -> Clip:
 
 
 def loss(
-    model: ModelConfig, train: TrainSettings, params: Params, clip: Clip, key: Array
+    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of the gate on imagined frames; see ``codec_task.score``."""
     assert isinstance(train, TrainConfig)
@@ -97,7 +97,7 @@ def loss(
     )
 
 
-def perceptual(model: ModelConfig, train: TrainSettings) -> Params | None:
+def perceptual(model: AssembledModel, train: TrainSettings) -> Params | None:
     """Return the weights of LPIPS that ``loss`` needs, under ``lpips``, or None.
 
     Raises:

@@ -11,13 +11,13 @@ from typing import Literal
 from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.experiment import Config
 from pewm_jax.config.mesh import MeshConfig
-from pewm_jax.config.model import ModelConfig
 from pewm_jax.config.parts import Codec, Encoder, Noise
 from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.worlds.pewm.world import PEWM
 
 CLIP = ClipConfig(frames=9, height=512, width=512)
 """The paper's clip."""
@@ -63,7 +63,7 @@ def experiment(
         ConfigError: the parts do not fit together.
     """
     return Config(
-        model=ModelConfig(
+        model=PEWM(
             clip=clip,
             codec=codec,
             # Channels are left to follow codec and control: 88 in, 32 out with CogVideoX's VAE.

@@ -16,7 +16,7 @@ from transformers import AutoTokenizer, T5EncoderModel
 import pewm_jax
 from pewm_jax import worlds
 from pewm_jax.codecs import rgbd
-from pewm_jax.config import ConfigError, EgoWMConfig, UserError
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.convert import commands, cosmos
 from pewm_jax.convert.options import ImportCosmos2
 from pewm_jax.io import tree
@@ -24,6 +24,7 @@ from pewm_jax.train import loading
 from pewm_jax.types import Camera, Control, Frames
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds import world_model as sampling
+from pewm_jax.worlds.egowm.world import EgoWM
 from tests.convert.pipelines import save_text
 from tests.helpers import random_frames
 from tests.models.cosmos.references import channels_first, channels_last, small_pipeline
@@ -195,7 +196,7 @@ def test_attention_over_time_is_not_causal_and_the_given_frame_and_earlier_chunk
 
 def test_it_loads_with_every_tensor_and_can_be_trained(world, folder, where):
     config, params = world
-    assert isinstance(config.model, EgoWMConfig)
+    assert isinstance(config.model, EgoWM)
     clip = config.model.clip
     assert (clip.frames, clip.height, clip.width, config.model.codec.temporal) == (9, 16, 16, 4)
     like = jax.eval_shape(lambda: worlds.init(config.model, jax.random.key(0)))

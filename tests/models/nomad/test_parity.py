@@ -12,11 +12,11 @@ import torch
 from torch.nn import functional
 
 from pewm_jax.config import UserError
-from pewm_jax.config.nomad import NomadConfig
 from pewm_jax.diffusion import squared_cosine
 from pewm_jax.models.nomad import convert as converter
 from pewm_jax.models.nomad import efficientnet
 from pewm_jax.models.nomad import model as nomad
+from pewm_jax.models.nomad.config import NomadConfig
 
 nn = torch.nn
 SMALL = NomadConfig(

@@ -12,14 +12,7 @@ import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import (
-    ClipConfig,
-    Config,
-    ConfigError,
-    EgoWMConfig,
-    EgoWMTrainConfig,
-    UserError,
-)
+from pewm_jax.config import ClipConfig, Config, ConfigError, UserError
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory.surfels import SurfelConfig
@@ -27,9 +20,10 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Control
 from pewm_jax.worlds import world_model
+from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 from tests.helpers import init_world, random_frames, randomise
 
-MODEL = EgoWMConfig(
+MODEL = EgoWM(
     clip=ClipConfig(frames=5, height=16, width=16, depth=False),
     codec=PixelConfig(temporal=1),
     backbone=DiTBackbone(layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16),

@@ -103,7 +103,7 @@ def test_a_world_begins_on_the_lattice_of_recorded_cells_and_with_what_it_sees()
     assert not cells[np.asarray(evidence.air_XYZ)].any()
     assert cells[np.asarray(evidence.colour_XYZ) >= 0].all()
     # A frame that was imagined says nothing of its cells.
-    still = jax.jit(persist.imagine, static_argnums=0, static_argnames="memory")
+    still = jax.jit(persist.PERSIST.imagine, static_argnums=0, static_argnames="memory")
     doubted = dataclasses.replace(MODEL, observation_logit=0.0)
     key, none = jax.random.key(0), np.zeros((1, 3), np.float32)
     one, two = (

@@ -11,7 +11,7 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import Config, ConfigError, PersistTrainConfig, UserError
+from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.memory import class_grid
@@ -26,6 +26,7 @@ from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist import step as persist_pictures
 from pewm_jax.worlds.persist import voxel_frames as persist_voxels
 from pewm_jax.worlds.persist import world as persist
+from pewm_jax.worlds.persist.config import PersistTrainConfig
 from pewm_jax.worlds.persist.state import encoded
 from tests.helpers import random_frames
 from tests.worlds.persist.tiny_persist import MODEL, NOISE
@@ -308,7 +309,7 @@ def test_without_its_memory_it_begins_anew_and_the_state_is_left(state, monkeypa
     monkeypatch.setattr(persist, "step", step)
     with jax.disable_jit():
         for memory in (True, False):
-            kept, _ = persist.imagine(MODEL, {}, state, MOVES[:1], KEY, memory=memory)
+            kept, _ = MODEL.imagine({}, state, MOVES[:1], KEY, memory=memory)
             equal(kept.map, state.map)
     equal([frames for frames, _ in begun], [state.frame])
     assert [real for _, real in begun] == [False]  # an imagined frame is no evidence

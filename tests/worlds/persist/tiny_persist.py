@@ -1,7 +1,7 @@
 """The smallest world of PERSIST."""
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ClipConfig, PersistConfig
+from pewm_jax.config import ClipConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.flow import FrameFlowConfig
 from pewm_jax.memory.class_grid import GridConfig
@@ -13,10 +13,11 @@ from pewm_jax.models.persist.config import (
     VoxelVAEConfig,
 )
 from pewm_jax.models.persist.nets import PersistNetsConfig
+from pewm_jax.worlds.persist.world import PERSIST
 
 BLOCKS = BlocksConfig(layers=1, heads=1, head_dim=8, mlp_ratio=2, context=3)
 NOISE = FrameFlowConfig(per_frame=True, sample_steps=1)
-MODEL = PersistConfig(
+MODEL = PERSIST(
     clip=ClipConfig(frames=3, height=16, width=16),
     codec=PixelConfig(spatial=4, temporal=1),
     backbone=PersistNetsConfig(

@@ -1,23 +1,28 @@
-"""The model: all settings that inference needs, and no others."""
+"""The settings of a world that is assembled from parts, as the code of the parts uses them."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pewm_jax.config.clip import ActionConfig, ClipConfig
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
-from pewm_jax.config.training import TrainConfig, TrainSettings
 from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, World
 from pewm_jax.errors import require
 from pewm_jax.registry import of, part, require_section
 
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pewm_jax.types import Array
+
 
 @dataclasses.dataclass(frozen=True)
-class ModelConfig(World):
-    """A video diffusion model with a memory (PEWM)."""
+class AssembledModel(World):
+    """Base class of the worlds that are assembled from parts.
 
-    TRAIN: ClassVar[type[TrainSettings]] = TrainConfig
+    A backbone denoises the latents of a codec; a control steers it, and a memory is read by it.
+    """
 
     clip: ClipConfig = ClipConfig()
     """Shape of a clip."""
@@ -97,10 +102,37 @@ class ModelConfig(World):
         """Steps of the noise's sampler."""
         return int(getattr(self.noise, "sample_steps", 0))
 
-    def with_sample_steps(self, steps: int) -> ModelConfig:
+    def with_sample_steps(self, steps: int) -> AssembledModel:
         """Return the same model with another number of the sampler's steps."""
         noise: Any = dataclasses.replace(self.noise, sample_steps=steps)  # type: ignore[call-arg]
         return dataclasses.replace(self, noise=noise)
+
+    def sharding(self) -> tuple[tuple[str, Any], ...]:
+        """Return the sharding rules of all parts, and of the stored prompt."""
+        memory = self.memory
+        parts = (self.backbone, memory.reader, self.codec, memory.encoder, self.control)
+        rules = [rule for part in parts for rule in part.SHARDING]
+        return (*rules, (r"text/(prompt|negative)_LC", (None, "fsdp")))
+
+    def split_heads(self, stage: Any) -> dict[str, int]:
+        """Return the head counts that ``train.mesh.tensor`` must divide."""
+        heads = {"backbone.heads": self.backbone.split_heads}
+        if stage.memory:
+            heads["memory.reader.heads"] = self.memory.reader.split_heads
+        return heads
+
+    def memory_points(self, memory: Any) -> tuple[Array, Array, Array, Array | None]:
+        """Return the memory as points; see ``World.memory_points``."""
+        return *self.memory.to_points(self, memory), getattr(memory, "observed_V", None)
+
+    def point_colours(self, features_VF: Array) -> np.ndarray:
+        """Return the (V, 3) colours in [−1, 1] in which the memory's points are drawn."""
+        import numpy as np  # noqa: PLC0415 - reading settings does not need it
+
+        values = np.asarray(features_VF)
+        if not self.memory.KEEPS_FEATURES or not len(values):
+            return values[..., :3]
+        return self.memory.encoder.colours(values)
 
     def __post_init__(self):
         """Validate what is in each section, and settings that depend on each other."""

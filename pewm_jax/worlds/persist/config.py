@@ -1,25 +1,34 @@
-"""PERSIST: a world whose state is a grid of class ids, which a diffusion model carries on."""
+"""Settings of PERSIST, as the modules of this folder use them; ``world.py`` has its methods."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import Any, ClassVar
 
-from pewm_jax.config.clip import ClipConfig
-from pewm_jax.config.model import ModelConfig
-from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
-from pewm_jax.config.training import StageConfig, TrainSettings
-from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities
+from pewm_jax.config import (
+    ArraySpec,
+    AssembledModel,
+    BatchSpec,
+    Capabilities,
+    ClipConfig,
+    Codec,
+    Conditioner,
+    Noise,
+    StageConfig,
+    TrainSettings,
+)
 from pewm_jax.errors import require
-from pewm_jax.registry import named, part
+from pewm_jax.memory.class_grid import GridConfig
+from pewm_jax.models.persist.nets import PersistNetsConfig
+from pewm_jax.registry import part
 
 POINT_WAVES = 4
-"""Wavelengths of the sinusoids of a place, with ``model.points``."""
+"""Wavelengths of the sinusoids of a position, with ``model.points``."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PersistTrainConfig(TrainSettings):
-    """How the world learns: its networks one after the other, the codec of pictures given."""
+    """How the world is trained: one network after the other; the codec of pictures is frozen."""
 
     run: str = "runs/persist"
     """Folder of this run: checkpoints, logs, images, report."""
@@ -33,23 +42,23 @@ class PersistTrainConfig(TrainSettings):
     voxel_statistics: StageConfig = StageConfig(steps=60, learning_rate=0.03, warmup=0)
     """Mean and scale of the voxels' latents are fitted."""
     world_frames: StageConfig = StageConfig()
-    """The transformer that makes the next voxel frame."""
+    """The transformer that predicts the next voxel frame."""
     camera: StageConfig = StageConfig()
-    """The transformer that says where the camera goes."""
+    """The transformer that predicts the camera."""
     renderer: StageConfig = StageConfig()
-    """The transformer that makes pictures of voxels."""
+    """The transformer that renders voxels."""
     blind: float = 0.3
-    """Share of frames after the first that are shown no picture."""
+    """Share of frames after the first that are not conditioned on a picture."""
 
     occupied: float = 1.0
-    """What the error of a world frame's latent counts where anything is in its cells, beside those
-    of air, which are most; 1 as published."""
+    """Weight of the error of a world frame's latent whose cells are not all air; 1 as published.
+    Most cells are air."""
     classes: float = 0.0
-    """What the classes of a world frame's cells count beside the error of its latents: their
-    cross-entropy through the frozen decoder; 0 as published. It needs a decoder that sees one
-    latent at a time (`voxel_vae.kernel` and `middle_kernel` 1, one number of `widths`)."""
+    """Weight of the cross-entropy of a world frame's classes, through the frozen decoder, relative
+    to the error of its latents; 0 as published. It needs a decoder that decodes one latent at a
+    time (`voxel_vae.kernel` and `middle_kernel` 1, one number of `widths`)."""
     compared: int = 256
-    """Latents of a frame whose cells are compared, drawn by what their error counts."""
+    """Latents of a frame whose classes are compared, drawn by the weights of their errors."""
 
     def __post_init__(self):
         """Validate."""
@@ -83,16 +92,16 @@ PUBLISHED_CLIP = ClipConfig(frames=16, height=288, width=512, depth=False)
 
 
 @dataclasses.dataclass(frozen=True)
-class PersistConfig(ModelConfig):
-    """A world that is three-dimensional itself (PERSIST, arXiv 2603.03482)."""
+class PersistModel(AssembledModel):
+    """Base class of ``PERSIST``: a world that is three-dimensional itself (arXiv 2603.03482)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = PersistTrainConfig
 
     clip: ClipConfig = PUBLISHED_CLIP
-    """What one clip is."""
+    """Shape of a clip."""
     codec: Codec = part("codec", "learned")
     """Codec: pictures to latents and back."""
-    backbone: Backbone = part("backbone", "persist")
+    backbone: PersistNetsConfig = part("backbone", "persist")
     """The four networks."""
     control: Conditioner = part(
         "control",
@@ -104,7 +113,7 @@ class PersistConfig(ModelConfig):
         angles=(),
     )
     """The numbers of an action; nothing else of it is used."""
-    memory: Memory = part("memory", "grid")
+    memory: GridConfig = part("memory", "grid")
     """The state of the world."""
     noise: Noise = part("noise", "frame_flow", per_frame=True, context_noise=0.1)
     """Noise of pictures, sampler."""
@@ -120,16 +129,16 @@ class PersistConfig(ModelConfig):
     """Nats that a real picture of blocks (`memory.pictures cells`) adds to the class that it shows
     in a cell: air before the measured depth, a surface at it; 0 as published."""
     points: bool = False
-    """Whether the picture that a voxel frame is shown comes with the place of its surfaces, from
-    its depth; not as published."""
+    """Whether the picture that conditions a voxel frame has the positions of its surfaces, from
+    depth, as further channels; not as published."""
     dead_reckoning: bool = False
-    """Whether the camera model says by what a step differs from the planar action, and not the step
-    itself; not as published."""
+    """Whether the camera model predicts how a step differs from the planar action, instead of the
+    step; not as published."""
 
     @property
     def batch_spec(self) -> BatchSpec:
         """Actions, and the recorded voxels around the agent."""
-        side = self.memory.recorded  # type: ignore[attr-defined]
+        side = self.memory.recorded
         voxels = (
             ("classes_TXYZ", ArraySpec((self.clip.frames, side, side, side), "uint16")),
             ("origin_T3", ArraySpec((self.clip.frames, 3))),
@@ -143,20 +152,17 @@ class PersistConfig(ModelConfig):
 
     @property
     def picture_channels(self) -> int:
-        """Channels of a picture's latents: with those of depth, if that is imagined."""
+        """Channels of a picture's latents; those of depth are among them if depth is imagined."""
         return self.codec.channels if self.clip.depth else self.codec.rgb_channels
 
     @property
     def shown_channels(self) -> int:
-        """Channels of what a voxel frame is shown of a picture."""
+        """Channels of the picture that conditions a voxel frame."""
         return self.picture_channels + (6 * POINT_WAVES if self.points else 0)
 
     def __post_init__(self):
         """Validate."""
-        for name, kind in (
-            ("backbone", named("backbone", "persist").settings),
-            ("memory", named("memory", "grid").settings),
-        ):
+        for name, kind in (("backbone", PersistNetsConfig), ("memory", GridConfig)):
             found = getattr(self, name)
             require(
                 isinstance(found, kind),
@@ -178,7 +184,7 @@ class PersistConfig(ModelConfig):
                 self.clip.depth or not getattr(self, name),
                 f"model.{name} needs depth: use clip.depth true, or leave {name} out.",
             )
-        pictures = self.memory.pictures  # type: ignore[attr-defined]
+        pictures = self.memory.pictures
         require(
             not self.observation_logit or pictures == "cells",
             f"model.observation_logit is {self.observation_logit} and memory.pictures {pictures}: "

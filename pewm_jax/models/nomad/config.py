@@ -1,13 +1,9 @@
-"""NoMaD, a policy that proposes waypoints: its network, and the world in which it is trained."""
+"""Settings of NoMaD, a policy that proposes waypoints."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar, Literal
 
-from pewm_jax.config.clip import ActionConfig, ClipConfig
-from pewm_jax.config.training import StageConfig, TrainSettings
-from pewm_jax.config.world import BatchSpec, Task
 from pewm_jax.errors import require, require_positive
 
 PLANE = 2
@@ -89,82 +85,4 @@ class NomadConfig:
             all(low < high for low, high in zip(self.lowest, self.highest, strict=True)),
             f"policy.lowest {self.lowest} and policy.highest {self.highest}: the first must be "
             "below the second.",
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class NomadTrainConfig(TrainSettings):
-    """How the policy learns: by imitation of recorded walks."""
-
-    run: str = "runs/nomad"
-    """Folder of this run: checkpoints, logs, numbers."""
-    preview_every: int = 0
-    """Steps between sample pictures; 0, since a policy imagines none."""
-    policy: StageConfig = StageConfig(steps=2000, batch=32, learning_rate=1e-4)
-    """The policy learns to walk as the recorded walks do."""
-    goal_hidden: float = 0.5
-    """Share of clips whose goal is hidden, so that the policy also explores without one."""
-    distance_weight: float = 1e-4
-    """Weight of the squared error of the distance, in steps; that of the noise is the rest to
-    1."""
-    nearest: int = 3
-    """A goal this near, or nearer, in steps, teaches its distance alone: the walk went past it."""
-
-    def __post_init__(self):
-        """Validate."""
-        super().__post_init__()
-        require(
-            self.preview_every == 0,
-            f"train.preview_every is {self.preview_every}: a policy imagines nothing to be shown, "
-            "use 0.",
-        )
-        require(
-            self.policy.batch >= 2,
-            "train.policy.batch is 1: a goal that cannot be reached is taken from another clip of "
-            "the batch, use 2 or more.",
-        )
-        for name in ("goal_hidden", "distance_weight"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"train.{name} is {value}: use a share in [0, 1].")
-        require(self.nearest >= 0, f"train.nearest is {self.nearest}: use 0 or more steps.")
-
-
-@dataclasses.dataclass(frozen=True)
-class NomadWorldConfig(Task):
-    """A policy by itself: a training task, by imitation of recorded walks."""
-
-    TRAIN: ClassVar[type[TrainSettings]] = NomadTrainConfig
-    EXPORTED: ClassVar[bool] = False
-    INSTEAD: ClassVar[str] = (
-        "trained a policy, which imagines nothing: have it propose ways by "
-        "pewm_jax.planning.nomad_policy, and imagine them with a world model"
-    )
-
-    clip: ClipConfig = ClipConfig(frames=24)
-    """What the loader reads: earlier pictures, the present one, and as many later ones as a goal
-    may be away."""
-    actions: ActionConfig = ActionConfig()
-    """Effect of an action in the walks."""
-    policy: NomadConfig = NomadConfig()
-    """The policy that is trained."""
-    dtype: Literal["float32", "bfloat16"] = "float32"
-    """Compute precision; master weights stay float32."""
-
-    @property
-    def batch_spec(self) -> BatchSpec:
-        """The clip's frames alone."""
-        return BatchSpec(context=False)
-
-    @property
-    def farthest(self) -> int:
-        """Steps to the farthest goal."""
-        return self.clip.frames - self.policy.context - 1
-
-    def __post_init__(self):
-        """Validate."""
-        require(
-            self.farthest >= self.policy.waypoints,
-            f"clip.frames is {self.clip.frames}: {self.policy.context} earlier pictures, the "
-            f"present one and {self.policy.waypoints} waypoints need "
-            f"{self.policy.context + 1 + self.policy.waypoints}, and goals farther away need more.",
         )
