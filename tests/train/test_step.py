@@ -108,7 +108,9 @@ def test_weights_that_a_stage_cannot_start_from_are_refused(fake_model):
 
 def test_a_batch_that_devices_cannot_share_is_refused(fake_model):
     mesh = jax.sharding.AbstractMesh((3, 1, 1, 1), AXES)
-    with pytest.raises(ConfigError, match=r"stage1\.batch is 8, which 3 devices"):
+    with pytest.raises(
+        ConfigError, match=r"stage1\.batch is 8, which cannot be split evenly over 3 devices"
+    ):
         sharding.require_divisible(fakes.config(), ONE, mesh)
 
 
