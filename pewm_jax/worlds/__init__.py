@@ -240,7 +240,9 @@ def _start(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    return act(model, forms.own(model, params), checks.in_metres(frames, depth_scale))
+    begun = act(model, forms.own(model, params), checks.in_metres(frames, depth_scale))
+    name = "observe" if act is _start_by_observing else "start"
+    return checks.returned_state(model, name, begun, (1, *frames.depth_THW.shape[1:]))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1), inline=True)
@@ -253,6 +255,7 @@ def _observe(
     depth_scale: Array | None,
 ) -> WorldState:
     after = act(model, forms.own(model, params), state, checks.in_metres(frames, depth_scale))
+    after = checks.returned_state(model, "observe", after, (1, *frames.depth_THW.shape[1:]))
     ok = checks.valid((), state.frame.camera)
     return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))
 
@@ -273,7 +276,9 @@ def _imagine(
 ) -> tuple[WorldState, Frames]:
     """Imagine; without ``remember`` the state has no memory: the caller's is not copied."""
     own = forms.own(model, params)
-    after, frames = act(model, own, state, control, key, remember=remember, memory=memory)
+    made = act(model, own, state, control, key, remember=remember, memory=memory)
+    present, count = state.frame.depth_THW.shape, checks.steps_of(control)
+    after, frames = checks.returned_frames(model, "imagine", made, present, count)
     ok = checks.valid(control, state.frame.camera)
     kept = checks.kept(ok, after.map, state.map) if remember else None
     return WorldState(checks.poisoned(ok, after.frame), kept), checks.poisoned(ok, frames)
@@ -295,7 +300,10 @@ def _imagine_many(
     """Return (K, 1) present frames, and (K, n) imagined ones or the last of them."""
     shown = {} if views is None else {"views": views}
     own = forms.own(model, params)
-    after, frames = act(model, own, state, controls, keys, memory=memory, last=last, **shown)
+    made = act(model, own, state, controls, keys, memory=memory, last=last, **shown)
+    present = (keys.shape[0], *state.frame.depth_THW.shape)
+    count = 1 if last else checks.steps_of(controls, 1)
+    after, frames = checks.returned_frames(model, "imagine_many", made, present, count)
     ok = checks.valid(controls, state.frame.camera, leading=1)
     return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
 
@@ -359,7 +367,9 @@ def _imagine_each(
     act = functools.partial(function(model, "imagine"), model, params, state)
 
     def candidate(control: Any, key: Array) -> tuple[Frames, Frames]:
-        after, frames = act(control, key, remember=False, memory=memory)
+        made = act(control, key, remember=False, memory=memory)
+        size, count = state.frame.depth_THW.shape, checks.steps_of(control)
+        after, frames = checks.returned_frames(model, "imagine", made, size, count)
         return after.frame, frames
 
     present, frames = jax.vmap(candidate)(controls, keys)
