@@ -249,9 +249,10 @@ def format_map_growth(metrics: Mapping[str, Any]) -> list[str]:
     if not found:
         return []
     held = found["occupied"]["mean"]
+    room = f", of {found['capacity']} that it has room for" if found["capacity"] else ""
     said = (
         f"Along long rollouts the map grows from {held[0]:.0f} to {held[-1]:.0f} points in "
-        f"{found['frames'][-1]} imagined frames, of {found['capacity']} that it has room for."
+        f"{found['frames'][-1]} imagined frames{room}."
     )
     return [said]
 
