@@ -62,7 +62,7 @@ def folders(run: str | Path) -> tuple[Path, Path]:
     """
     folder = shipped.find(run)
     if not folder.is_dir():
-        raise UserError(f"{run} does not exist; train a model first, e.g. `python train.py demo`.")
+        raise UserError(f"{run} does not exist; train a model first, e.g. `pewm-jax train demo`.")
     return folder, shipped.home(run)
 
 
@@ -100,7 +100,7 @@ def has_memory(opened: LoadedRun) -> bool:
         if asked:
             raise UserError(
                 f"{opened.folder / WEIGHTS} has no memory blocks yet, only stage 1 is trained; "
-                "finish training with `python train.py`, which goes on where it stopped."
+                "finish training with `pewm-jax train`, which goes on where it stopped."
             )
         _require_all_steps(opened)
         return False
@@ -115,7 +115,7 @@ def _require_all_steps(opened: LoadedRun) -> None:
         if done < wanted:
             raise UserError(
                 f"{opened.folder / WEIGHTS} is of step {done} and {wanted} of {stage.name} were "
-                "asked for; finish training with `python train.py`, which goes on where it stopped."
+                "asked for; finish training with `pewm-jax train`, which goes on where it stopped."
             )
 
 
