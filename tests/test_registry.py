@@ -14,10 +14,12 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
 from pewm_jax import registry as kinds
+from pewm_jax.cli import evaluate as evaluation
 from pewm_jax.cli import flags
 from pewm_jax.cli import main as program
 from pewm_jax.cli import parser as cli
 from pewm_jax.cli import plugins as imports
+from pewm_jax.cli import train as training
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import (
     ClipConfig,
@@ -114,6 +116,39 @@ def test_an_entry_point_that_cannot_be_imported_is_named_only_if_the_kind_is_not
     with pytest.raises(ConfigError, match=r"mine_broken cannot be imported .*no_such_lib") as error:
         named_mine("absent")
     assert "'ours' of pewm_jax.kinds" in one_sentence(error)
+
+
+WORLD = """
+    import dataclasses
+
+    from pewm_jax.config import World, register
+
+
+    @register("world", "mine")
+    @dataclasses.dataclass(frozen=True)
+    class Mine(World):
+        width: int = 3
+
+        def init(self, key): ...
+        def stages(self): ...
+        def observe(self, params, state, frames): ...
+        def imagine(self, params, state, control, key, **rest): ...
+"""
+
+
+def test_a_world_of_an_entry_point_is_trained_and_gets_a_protocol_by_its_name(
+    tmp_path, monkeypatch
+):
+    package(tmp_path, "mine_broken", "import no_such_library")
+    with pytest.raises(ConfigError, match=r"no preset 'mine'.*no world of kind 'mine'"):
+        training.arguments(["mine"], "pewm-jax train")
+    package(tmp_path, "mine_world", WORLD)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    given = training.arguments(["mine"], "pewm-jax train")
+    assert given.groups["config"][1].model.width == 3
+    assert evaluation._settings_of("mine").model.width == 3
+    with pytest.raises(ConfigError, match=r"no preset 'dmo' \(did you mean demo.*no_such_library"):
+        training.arguments(["dmo"], "pewm-jax train")
 
 
 def test_a_module_of_entry_points_is_imported_once(tmp_path, monkeypatch):

@@ -12,6 +12,7 @@ from pewm_jax import config as configuration
 from pewm_jax import presets, shipped
 from pewm_jax import registry as kinds
 from pewm_jax.cli import parser
+from pewm_jax.cli import train as training
 from pewm_jax.cli.parser import Flat
 from pewm_jax.config import Config, EvalConfig, Join, World
 from pewm_jax.errors import ConfigError
@@ -121,7 +122,7 @@ class ProtocolSettings:
     """
 
     name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="PRESET_OR_RUN")]
-    """A preset or a run."""
+    """A preset, a run, or the name of a world that a plugin registers."""
     data: Path | None = None
     """Folder of the data set."""
     chosen: Flat[Chosen] = UNCHOSEN
@@ -143,12 +144,14 @@ def protocol(settings: ProtocolSettings) -> None:
 
 
 def _settings_of(name: str) -> Config:
-    """Return the settings of a preset, or of a run or weights that ship with the library."""
+    """Return the settings of a preset, a run, shipped weights, or a world of a plugin."""
     file = shipped.find(name) / "config.json"
     if name not in presets.names() and file.is_file():
         config = configuration.load(file)
+    elif name in presets.names():
+        config = presets.load(name)
     else:
-        config = presets.load(parser.choose(name, presets.names(), "preset or run"))
+        config = training.of_world(name, presets.names(), "preset or run")
     if not isinstance(config.model, World):
         raise ConfigError(
             f"{name} trains no world model, but protocols are for rollouts: use "

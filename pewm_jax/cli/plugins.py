@@ -5,11 +5,12 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
 from pewm_jax import registry as kinds
-from pewm_jax.config import ConfigError
+from pewm_jax.config import ConfigError, UserError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,12 +64,18 @@ def load_file(name: str) -> None:
     """Import a Python file; its module has the file's name.
 
     Raises:
-        ConfigError: there is no such file, or it cannot be imported.
+        ConfigError: there is no such file, it cannot be imported, or it is called as a module of
+            Python or of an installed package, which it would replace.
     """
     file = Path(name)
     if not name.endswith(".py") or not file.is_file():
         raise ConfigError(
             f"--plugin needs the path of a Python file that registers kinds, got {name!r}."
+        )
+    if _hides_a_module(file):
+        raise ConfigError(
+            f"--plugin: {file} is called as the module {file.stem!r}, which it would replace: "
+            f"rename it, such as to my_{file.stem}.py."
         )
     spec = importlib.util.spec_from_file_location(file.stem, file)
     assert spec is not None
@@ -79,8 +86,31 @@ def load_file(name: str) -> None:
         spec.loader.exec_module(module)
     except Exception as error:  # a file may raise anything when it is run
         del sys.modules[file.stem]
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
-        raise ConfigError(f"--plugin: {file} cannot be imported ({reason}).") from error
+        raise ConfigError(f"--plugin: {file} cannot be imported{_why(error, file)}") from error
+
+
+def _hides_a_module(file: Path) -> bool:
+    """Tell whether a file is called as a module of Python or of an installed package."""
+    if file.stem in sys.stdlib_module_names:
+        return True
+    try:
+        spec = importlib.util.find_spec(file.stem)
+    except (ImportError, ValueError):
+        return False
+    if spec is None or spec.origin is None or "site-packages" not in Path(spec.origin).parts:
+        return False
+    return Path(spec.origin).resolve() != file.resolve()
+
+
+def _why(error: Exception, file: Path) -> str:
+    """Return the end of a sentence: the line that raised an error, and the error."""
+    text = " ".join(str(error).split())
+    if isinstance(error, UserError):
+        return f": {text}"
+    frames = traceback.extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == file.resolve()]
+    where = f"line {lines[-1]}, " if lines else ""
+    return f" ({where}{type(error).__name__}: {text})."
 
 
 def look_here() -> None:

@@ -62,15 +62,35 @@ def arguments(argv: Sequence[str], prog: str) -> Arguments:
     name, folder = argv[0], Path(argv[0])
     if name not in known and (folder / "config.json").is_file():
         default, about = _settings_in(folder), f"The settings in {folder}."
-    elif name not in known and name in registry.names("world"):
-        world = registry.named("world", name).settings
-        default = Config(model=world(), train=world.TRAIN())
-        about = f"The world {name}, with its own defaults."
+    elif name in known:
+        default, about = presets.load(name), presets.describe(name)
     else:
-        default = presets.load(parser.choose(name, known, "preset"))
-        about = presets.describe(name)
+        default = of_world(name, known, "preset")
+        about = f"The world {name}, with its own defaults."
     groups = {**chosen, "config": (type(default), default)}
     return Arguments(groups, about, hint=f"{prog} {name}")
+
+
+def of_world(name: str, known: Sequence[str], what: str) -> Config:
+    """Return the own defaults of a world that a plugin or an installed package registers.
+
+    Args:
+        name: the world's.
+        known: what else could have been meant, for the message.
+        what: what these are.
+
+    Raises:
+        ConfigError: there is no such world.
+    """
+    try:
+        world = registry.named("world", name).settings
+    except ConfigError as error:
+        try:
+            parser.choose(name, known, what)
+        except ConfigError as first:
+            raise ConfigError(f"{first} {error}") from None
+        raise
+    return Config(model=world(), train=world.TRAIN())
 
 
 def run(chosen: Chosen, config: Config) -> None:

@@ -51,6 +51,15 @@ class Report:
     protocol: Protocol
 
     @property
+    def again(self) -> str:
+        """The run and the data that it is of, as `pewm-jax evaluate` takes them."""
+        if Path(self.name) != self.folder:
+            return self.name
+        home, data = self.folder.parent, self.metrics["protocol"]["config"]["data"]["path"]
+        run = home if (home / "config.json").is_file() else home.name
+        return f"{run} --data {data}"
+
+    @property
     def facts(self) -> dict[str, Any]:
         """Return the entry for ``comparison.json``."""
         said = self.metrics["protocol"]
@@ -159,7 +168,7 @@ def _require_same_protocol(one: Report, two: Report) -> None:
             f"{one.name} and {two.name} were scored by different protocols "
             f"({one.protocol.sha256[:12]} and {two.protocol.sha256[:12]}: "
             f"{difference(one.protocol, two.protocol)}), so their clips cannot be paired; evaluate "
-            f"one with the other's: `pewm-jax evaluate {two.name} --protocol {file}`."
+            f"one with the other's: `pewm-jax evaluate {two.again} --protocol {file}`."
         )
 
 

@@ -62,7 +62,7 @@ def folders(run: str | Path) -> tuple[Path, Path]:
     """
     folder = shipped.find(run)
     if not folder.is_dir():
-        raise UserError(f"{run} does not exist; train a model first, e.g. `python train.py demo`.")
+        raise UserError(f"{run} does not exist; train a model first, e.g. `pewm-jax train demo`.")
     return folder, shipped.home(run)
 
 
@@ -100,7 +100,7 @@ def has_memory(loaded: LoadedRun) -> bool:
         if asked:
             raise UserError(
                 f"{loaded.folder / WEIGHTS} has no memory blocks yet, because only stage 1 is "
-                "trained; finish training with `python train.py`, which resumes."
+                "trained; finish training with `pewm-jax train`, which resumes."
             )
         _require_all_steps(loaded)
         return False
@@ -115,7 +115,7 @@ def _require_all_steps(loaded: LoadedRun) -> None:
         if done < wanted:
             raise UserError(
                 f"{loaded.folder / WEIGHTS} is from step {done} of {wanted} of {stage.name}; "
-                "finish training with `python train.py`, which resumes."
+                "finish training with `pewm-jax train`, which resumes."
             )
 
 

@@ -197,7 +197,8 @@ class Page:
 
     def _add_editing(self) -> None:
         gui, scene = self._server.gui, self._server.scene
-        with gui.add_folder("Edit the world"):
+        self._editing = gui.add_folder("Edit the world")
+        with self._editing:
             gui.add_html(
                 "<div style='padding:0 12px 4px;opacity:.75;font-size:12.5px;line-height:1.45'>"
                 "<b>Shift + drag</b> a rectangle in the map, or <b>shift + click</b>, to choose a "
@@ -279,10 +280,13 @@ class Page:
         self._steps = steps
 
     def _show_choices(self, shown: PageUpdate) -> None:
-        """Show the available sampler steps, worlds and files."""
+        """Show the available sampler steps, worlds and files, and what this model can do."""
         if not hasattr(self, "_files"):  # the page is still being built
             return
         count = str(shown.engine.sampler_steps) if shown.engine is not None else "0"
+        if shown.engine is not None:
+            self._editing.visible = shown.engine.editable
+            self._steps.visible = count != "0"
         if count not in ("0", self._steps.value):
             self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))
             self._steps.value = count

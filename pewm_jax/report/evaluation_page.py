@@ -404,9 +404,10 @@ def growth(metrics: Mapping[str, Any]) -> Section | None:
         [_interval_line("memory", found["occupied"])],
         x=found["frames"],
     )
+    room = f"; its capacity is {found['capacity']}" if found["capacity"] else ""
     note = (
-        "Cells or surfels in the map, from the observed frames (0) on, after each imagined clip; "
-        f"its capacity is {found['capacity']}. Mean over houses with its 95 % interval."
+        "Points in the map, from the observed frames (0) on, after each imagined clip"
+        f"{room}. Mean over houses with its 95 % interval."
     )
     return Section("How the map grows", [Charts([chart]), Text(note, "quiet")])
 

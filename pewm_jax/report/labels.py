@@ -250,9 +250,10 @@ def format_map_growth(metrics: Mapping[str, Any]) -> list[str]:
     if not found:
         return []
     held = found["occupied"]["mean"]
+    room = f", with a capacity of {found['capacity']}" if found["capacity"] else ""
     said = (
         f"Along long rollouts the map grows from {held[0]:.0f} to {held[-1]:.0f} points in "
-        f"{found['frames'][-1]} imagined frames, with a capacity of {found['capacity']}."
+        f"{found['frames'][-1]} imagined frames{room}."
     )
     return [said]
 

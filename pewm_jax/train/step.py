@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from pewm_jax.config import Config
+from pewm_jax.config import Config, UserError
 from pewm_jax.io import tree
 from pewm_jax.train import optimizer, sharding
 from pewm_jax.train.stages import Stage
@@ -151,7 +151,8 @@ def train_step(
 
     def loss_of(trained: Params) -> tuple[Array, Metrics]:
         params = tree.merge(trained, frozen, extra or {})
-        return stage.loss(config.model, config.train, params, clip, step_key)
+        found = stage.loss(config.model, config.train, params, clip, step_key)
+        return _require_loss(found, f"The loss of {stage.title}")
 
     (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
     gradients = sharding.constrain(config.model, gradients)
@@ -290,6 +291,26 @@ def compile_step(
     if extra is None:
         return compiled
     return lambda state, clip, key: compiled(state, clip, key, extra)
+
+
+def _require_loss(found: Any, what: str) -> tuple[Array, Metrics]:
+    """Return what a loss returned, or refuse anything but one number and numbers by name.
+
+    Raises:
+        UserError: it is something else.
+    """
+    if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], dict):
+        raise UserError(
+            f"{what} must return (loss, measured), a number and a dictionary of numbers; it "
+            f"returned a {type(found).__name__}."
+        )
+    for name, value in {"loss": found[0], **found[1]}.items():
+        if jnp.shape(value) != ():
+            raise UserError(
+                f"{what} returned {name} of shape {jnp.shape(value)}: it must be one number; take "
+                "the mean over the batch."
+            )
+    return found
 
 
 def _norm(gradients: Params) -> Array:

@@ -228,7 +228,9 @@ def _start(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    return model.start(forms.own(model, params), checks.in_metres(frames, depth_scale))
+    state = model.start(forms.own(model, params), checks.in_metres(frames, depth_scale))
+    name = "observe" if type(model).start is World.start else "start"
+    return checks.returned_state(model, name, state, (1, *frames.depth_THW.shape[1:]))
 
 
 @functools.partial(jax.jit, static_argnums=0, inline=True)
@@ -241,6 +243,7 @@ def _observe(
 ) -> WorldState:
     own, frames = forms.own(model, params), checks.in_metres(frames, depth_scale)
     after = model.observe(own, state, frames)
+    after = checks.returned_state(model, "observe", after, (1, *frames.depth_THW.shape[1:]))
     ok = checks.valid((), state.frame.camera)
     return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))
 
@@ -258,7 +261,9 @@ def _imagine(
 ) -> tuple[WorldState, Frames]:
     """Imagine; without ``remember`` the state has no memory: the caller's is not copied."""
     own = forms.own(model, params)
-    after, frames = model.imagine(own, state, control, key, remember=remember, memory=memory)
+    found = model.imagine(own, state, control, key, remember=remember, memory=memory)
+    present, count = state.frame.depth_THW.shape, checks.steps_of(control)
+    after, frames = checks.returned_frames(model, "imagine", found, present, count)
     ok = checks.valid(control, state.frame.camera)
     kept = checks.kept(ok, after.map, state.map) if remember else None
     return WorldState(checks.poisoned(ok, after.frame), kept), checks.poisoned(ok, frames)
@@ -279,9 +284,15 @@ def _imagine_many(
     """Return (K, 1) present frames, and (K, n) imagined ones or the last of them."""
     shown = {} if views is None else {"views": views}
     own = forms.own(model, params)
-    after, frames = model.imagine_many(
-        own, state, controls, keys, memory=memory, last=last, **shown
-    )
+    size, count = state.frame.depth_THW.shape, checks.steps_of(controls, 1)
+    if type(model).imagine_many is World.imagine_many:  # refuse a wrong ``imagine`` by its name
+        imagine_one = functools.partial(model.imagine, remember=False, memory=memory)
+        control, key = jax.tree.map(lambda x: x[0], (controls, keys))
+        found = jax.eval_shape(imagine_one, own, state, control, key)
+        checks.returned_frames(model, "imagine", found, size, count)
+    found = model.imagine_many(own, state, controls, keys, memory=memory, last=last, **shown)
+    present, count = (keys.shape[0], *size), 1 if last else count
+    after, frames = checks.returned_frames(model, "imagine_many", found, present, count)
     ok = checks.valid(controls, state.frame.camera, leading=1)
     return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
 

@@ -317,6 +317,73 @@ def kept(ok: Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(ok, a, b) if a.shape == b.shape else a, new, old)
 
 
+def returned_state(model: Any, name: str, found: Any, size: tuple[int, ...]) -> WorldState:
+    """Return the state that a world's own method returned, or refuse it by the method's name.
+
+    Args:
+        model: the world.
+        name: the method.
+        found: what it returned.
+        size: (1, H, W) of the present frame, or (K, 1, H, W).
+
+    Raises:
+        UserError: this is no state, or its frame has another shape or dtype.
+    """
+    who = f"{type(model).__name__}.{name}()"
+    if not isinstance(found, WorldState):
+        raise UserError(f"{who} must return a WorldState; it returned a {type(found).__name__}.")
+    _check_returned(found.frame, f"{who} returned a state whose frame", size)
+    return found
+
+
+def returned_frames(
+    model: Any, name: str, found: Any, present: tuple[int, ...], count: int
+) -> tuple[WorldState, Frames]:
+    """Return what a world's own method imagined, or refuse it by the method's name.
+
+    Args:
+        model: the world.
+        name: the method.
+        found: what it returned.
+        present: as ``size`` of ``returned_state``.
+        count: the number of frames that were asked for.
+
+    Raises:
+        UserError: this is no state with frames, or a shape or dtype is another.
+    """
+    who = f"{type(model).__name__}.{name}()"
+    if not isinstance(found, tuple) or len(found) != 2:
+        raise UserError(
+            f"{who} must return (WorldState, Frames); it returned a {type(found).__name__}."
+        )
+    state = returned_state(model, name, found[0], present)
+    _check_returned(found[1], f"{who} returned frames that", (*present[:-3], count, *present[-2:]))
+    return state, found[1]
+
+
+def steps_of(control: Any, leading: int = 0) -> int:
+    """Return the number of frames that a control, from ``check_control``, asks for."""
+    camera = control.camera if isinstance(control, Control) else control
+    steps = camera.intrinsics_4 if isinstance(camera, Camera) else camera
+    return jnp.shape(steps)[leading]
+
+
+def _check_returned(frames: Any, what: str, size: tuple[int, ...]) -> None:
+    """Refuse frames of a world's own that have another shape, or integers."""
+    if not isinstance(frames, Frames):
+        raise UserError(f"{what} must be Frames: a {type(frames).__name__} is none.")
+    *leading, _, _ = size
+    wanted = ((*size, 3), size, (*leading, 4, 4), (*leading, 4))
+    for (name, value), shape in zip(_fields(frames), wanted, strict=True):
+        if jnp.shape(value) != shape:
+            raise UserError(f"{what} must have {name} {shape}: they are {jnp.shape(value)}.")
+        if not jnp.issubdtype(jnp.result_type(value), jnp.floating):
+            raise UserError(
+                f"{what} must have {name} of type float32: they are {value.dtype} "
+                "(codecs.signals.as_signal converts colours)."
+            )
+
+
 def _fields(frames: Frames) -> tuple[tuple[str, Any], ...]:
     return (
         ("colours", frames.rgb_THWC),

@@ -45,16 +45,16 @@ def require_actions(model: World, actions_TA: Array | None, who: str) -> None:
     wanted, kind = model.batch_spec.actions, model.facts.control
     if not wanted:
         return
+    steered = f"this model's control ({kind})" if kind else "this model"
     if actions_TA is None:
         raise UserError(
-            f"{who} got cameras without actions, and this model's control "
-            f"({kind}) is steered by actions of {wanted} numbers: give "
-            "actions, or a Control with both."
+            f"{who} got cameras without actions, and {steered} is steered "
+            f"by actions of {wanted} numbers: give actions, or a Control with both."
         )
     if actions_TA.shape[-1] != wanted:
         raise UserError(
-            f"{who} got actions of {actions_TA.shape[-1]} numbers, and this model's control "
-            f"({kind}) takes {wanted}: give those it was trained with."
+            f"{who} got actions of {actions_TA.shape[-1]} numbers, and {steered} takes "
+            f"{wanted}: give those it was trained with."
         )
 
 

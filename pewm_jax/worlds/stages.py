@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-from pewm_jax.config import Config, StageConfig
+from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.io import tree
 from pewm_jax.types import Array, Clip, Params
 
@@ -81,8 +81,19 @@ class Stage:
         return tree.assign(self.rules, params, f"rules of {self.name}")
 
     def settings(self, config: Config) -> StageConfig:
-        """Return this stage's settings."""
-        return getattr(config.train, self.name)
+        """Return this stage's settings.
+
+        Raises:
+            UserError: the world's ``TRAIN`` has no field of the stage's name.
+        """
+        found = getattr(config.train, self.name, None)
+        if not isinstance(found, StageConfig):
+            kind = type(config.train).__name__
+            raise UserError(
+                f"The stage {self.name!r} has no settings: {kind}, the TRAIN of "
+                f"{type(config.model).__name__}, needs a field `{self.name}: StageConfig`."
+            )
+        return found
 
     def data_seed(self, config: Config) -> int:
         """Return the seed of this stage's data order."""

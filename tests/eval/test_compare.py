@@ -158,6 +158,8 @@ def test_different_protocols_are_refused(tmp_path, errors):
     b = report(tmp_path / "b", errors, chosen=protocol(context=5))
     with pytest.raises(UserError, match=r"different protocols .*context 6 and 5.*--protocol"):
         compare.compare(a, b)
+    with pytest.raises(UserError, match=rf"evaluate {b.name} --data \S+ --protocol \S+a/report/"):
+        compare.compare(a, b / "report")  # the folder of a report is no run
     assert not (a / "compare-b").exists()
     assert program.main(["compare", str(a), str(b)]) == 2
 

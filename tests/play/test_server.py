@@ -19,7 +19,7 @@ from pewm_jax.cli import play
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.play import page, panels, serving, session
 from pewm_jax.play.settings import Serve, Start
-from tests.play.tiny_drive import FORWARD, a_place, a_toy
+from tests.play.tiny_drive import FORWARD, Toy, a_place, a_toy
 
 LONG = 120
 
@@ -131,6 +131,17 @@ def test_a_box_goes_where_it_was_dragged_and_the_agent_too(tmp_path):
         view.ceiling = view.tint = True
         view.redraw()
         assert len(view.points) == len(one.driver.engine.points(one.driver._session.world)[0])
+
+
+@pytest.mark.parametrize(("editable", "steps"), [(True, 2), (False, 0)])
+def test_only_what_the_model_can_do_is_offered(tmp_path, monkeypatch, editable, steps):
+    a_place()
+    monkeypatch.setattr(Toy, "editable", editable)
+    monkeypatch.setattr(Toy, "sampler_steps", steps)
+    with a_page(tmp_path) as one:
+        assert one.driver.wait(LONG)
+        assert one._editing.visible == editable
+        assert one._steps.visible == (steps > 0)
 
 
 def test_a_page_of_another_site_cannot_drive(tmp_path):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets as configs
-from pewm_jax.config import AXES, ConfigError
+from pewm_jax.config import AXES, ConfigError, UserError
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.train import optimizer, sharding, stages, step
@@ -104,6 +104,29 @@ def test_weights_that_a_stage_cannot_start_from_are_refused(fake_model):
     wrong = {"backbone": {"kernel": jnp.zeros((3, 4)), "bias": jnp.zeros(3)}}
     with pytest.raises(tree.TreeError, match=r"Initial weights of stage 2 .* \(3, 4\)"):
         state.create(config, TWO, key, wrong)
+
+
+def test_a_stage_without_settings_is_named(fake_model):
+    stage = dataclasses.replace(ONE, name="other")
+    with pytest.raises(UserError, match=r"'other' has no settings: .* needs a field `other: Stage"):
+        stage.settings(fakes.config())
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        (jnp.zeros(()), r"must return \(loss, measured\), .*; it returned a"),
+        ((jnp.zeros(()), jnp.zeros(())), r"must return \(loss, measured\)"),
+        ((jnp.zeros(3), {}), r"returned loss of shape \(3,\): it must be one number"),
+        ((jnp.zeros(()), {"psnr": jnp.zeros(3)}), r"returned psnr of shape \(3,\)"),
+    ],
+)
+def test_a_loss_that_is_no_number_is_refused(fake_model, found, message):
+    config = fakes.config()
+    stage = dataclasses.replace(ONE, loss=lambda *_: found)
+    now = state.create(config, stage, jax.random.key(0))
+    with pytest.raises(UserError, match=rf"The loss of stage 1 {message}"):
+        step.train_step(config, stage, now, fakes.clip(config, 8, 0), jax.random.key(0))
 
 
 def test_a_batch_that_devices_cannot_share_is_refused(fake_model):

@@ -130,8 +130,13 @@ def select_fvd(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDi
     """
     if setting == OFF:
         return None, "FVD and KVD are not measured (evaluate.fvd)."
+    short = (
+        f"I3D needs {i3d.LEAST} frames, but a clip has {frames} including the observed one; "
+        "--chain makes longer ones."
+    )
     if setting:
-        i3d.require_frames(1, frames, i3d.SIDE, i3d.SIDE, 3)
+        if frames < i3d.LEAST:
+            raise UserError(f"--fvd is {setting}, and clips are too short for I3D: {short}")
         metric = videos.read_i3d(i3d_weights.find(None if setting == ON else setting), "fvd")
         return metric, metric.about
     path = i3d_weights.installed()
@@ -141,10 +146,7 @@ def select_fvd(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDi
             f"{i3d_weights.INSTALL}, or give a weights file by --fvd."
         )
     if frames < i3d.LEAST:
-        return None, (
-            f"FVD and KVD are not measured: I3D needs {i3d.LEAST} frames and a clip has {frames} "
-            "including the observed one; --chain makes longer ones."
-        )
+        return None, f"FVD and KVD are not measured: {short}"
     if not accelerator:
         return None, (
             "FVD and KVD are not measured: without an accelerator I3D takes longer than imagining "
