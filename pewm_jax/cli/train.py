@@ -26,6 +26,7 @@ EXAMPLES = {
     "plan": (
         "pewm_5b --devices 64 --chip h200",
         "pewm_2b --devices 8 --chip h100 --train.mesh.fsdp 8",
+        "pewm_2b --devices 8 --chip v5p --compiler target --json plan.json",
     ),
 }
 ABOUT = {
@@ -99,8 +100,10 @@ def run(chosen: Chosen, config: Config) -> None:
 def plan(chosen: Chosen, config: Config) -> None:
     """Print what a training would take on other hardware."""
     from pewm_jax.plan import plan as planning
+    from pewm_jax.plan import target_plan
 
-    planning.show(config, dataclasses.replace(chosen.launch, plan=True))
+    show = target_plan.show if chosen.launch.compiler == "target" else planning.show
+    show(config, dataclasses.replace(chosen.launch, plan=True))
 
 
 def _epilog(prog: str, examples: Sequence[str]) -> str:

@@ -51,8 +51,8 @@ def splash(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, *, interpret: bool = Fal
     """
     from jax.experimental.pallas.ops.tpu import splash_attention as pallas  # noqa: PLC0415 - slow
 
-    heads, queries, channels = q_BKND.shape[1:]
-    keys = k_BKMD.shape[2]
+    _, heads, queries, channels = q_BKND.shape
+    keys: int = k_BKMD.shape[2]
     rows, columns = tile(queries), tile(keys)
     q = _padded(q_BKND * channels**-0.5, rows)
     k, v = _padded(k_BKMD, columns), _padded(v_BKMD, columns)

@@ -268,7 +268,7 @@ def trace_step(
         donate_argnums=0,
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
-    kind = target.of_devices(mesh.devices.ravel())
+    kind = target.of_devices(mesh.devices.ravel().tolist())
     with jax.set_mesh(mesh), target.use(kind):  # ``nn.placement`` and the kernels ask for them
         return step.trace(state, batch, abstract_key, *extra)
 
