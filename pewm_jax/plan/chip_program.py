@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pewm_jax.plan import hlo
 from pewm_jax.plan.hlo import Line
 
-FREE = (
+NO_TRAFFIC = (
     "parameter",
     "constant",
     "tuple",
@@ -120,7 +120,7 @@ class _Walk:
                 called = _CALLED.search(line.rest)
                 if called:
                     cost.add(self.computation(called[1]))
-            elif opcode not in FREE and not opcode.endswith(("-done", "-update")):
+            elif opcode not in NO_TRAFFIC and not opcode.endswith(("-done", "-update")):
                 cost.bytes += self._traffic(line, lines)
                 cost.collectives += self._collectives(line, lines)
                 kernel = self._kernel(line)

@@ -6,9 +6,9 @@ needs a device or a driver. A TPU is described by its name, a GPU by the numbers
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.metadata
-import importlib.util
 import itertools
 from collections.abc import Sequence
 from typing import Any
@@ -18,16 +18,16 @@ from pewm_jax.train.chips import Chip
 
 EXTRAS = {"tpu": "plan-tpu", "cuda": "plan-cuda"}
 """Platform → the extra that installs its compiler."""
-MODULES = {
-    "tpu": ("libtpu",),
-    "cuda": ("jax_cuda12_plugin", "jax_plugins.xla_cuda12", "nvidia.cuda_nvcc", "nvidia.cudnn"),
-}
-"""Platform → the modules that its compiler needs."""
 PACKAGES = {
     "tpu": ("libtpu",),
-    "cuda": ("jax-cuda12-pjrt", "nvidia-cuda-nvcc-cu12", "nvidia-cudnn-cu12"),
+    "cuda": (
+        "jax-cuda12-pjrt",
+        "jax-cuda12-plugin",
+        "nvidia-cuda-nvcc-cu12",
+        "nvidia-cudnn-cu12",
+    ),
 }
-"""Platform → the packages whose versions identify the compiler, the compiler itself first."""
+"""Platform → the packages that its compiler needs, the compiler itself first."""
 ENVIRONMENT = {
     "JAX_PLATFORMS": "cpu",
     "TPU_SKIP_MDS_QUERY": "1",
@@ -126,7 +126,8 @@ def require_compiler(chip: Chip) -> None:
     Raises:
         UserError: it is not; the message names the extra that installs it.
     """
-    missing = [name for name in MODULES[chip.platform] if not _is_installed(name)]
+    versions = _versions(chip)
+    missing = [name for name in PACKAGES[chip.platform] if name not in versions]
     if missing:
         raise UserError(
             f"--compiler target for {chip.name} needs {', '.join(missing)}: run `pip install "
@@ -135,16 +136,18 @@ def require_compiler(chip: Chip) -> None:
         )
 
 
-def _is_installed(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except ModuleNotFoundError:  # its parent is absent
-        return False
+def _versions(chip: Chip) -> dict[str, str]:
+    """Return the versions of those of a compiler's packages that are installed."""
+    found = {}
+    for name in PACKAGES[chip.platform]:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found
 
 
 def compiler(chip: Chip) -> dict[str, str]:
     """Return the name and version of a chip's compiler, with those of its libraries."""
-    versions = {name: importlib.metadata.version(name) for name in PACKAGES[chip.platform]}
+    versions = _versions(chip)
     first, *others = versions
     beside = "".join(f", {name} {versions[name]}" for name in others)
     return {"name": first, "version": versions[first] + beside}

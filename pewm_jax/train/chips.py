@@ -48,7 +48,7 @@ class Chip:
 CHIPS = (
     Chip(
         name="a100",
-        device_kind=r"(NVIDIA )?A100( SXM4)?( 80GB)?",
+        device_kind=r"A100|(NVIDIA )?A100( SXM4)? 80GB",
         flops=312e12,
         memory=80e9,
         bandwidth=2039e9,
