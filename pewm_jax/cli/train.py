@@ -102,8 +102,13 @@ def plan(chosen: Chosen, config: Config) -> None:
     from pewm_jax.plan import plan as planning
     from pewm_jax.plan import target_plan
 
-    show = target_plan.show if chosen.launch.compiler == "target" else planning.show
-    show(config, dataclasses.replace(chosen.launch, plan=True))
+    launch = dataclasses.replace(chosen.launch, plan=True)
+    if launch.compiler == "target":
+        target_plan.show(config, launch)
+        return
+    plans = planning.show(config, launch)
+    if launch.json:
+        target_plan.write(Path(launch.json), [target_plan.estimate(plan) for plan in plans])
 
 
 def _epilog(prog: str, examples: Sequence[str]) -> str:

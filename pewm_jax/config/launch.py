@@ -73,7 +73,7 @@ class Launch(Join):
     """Of a plan: `target` compiles the step with the chip's own compiler, which needs the extra
     plan-tpu or plan-cuda; `cpu` compiles it for virtual CPU devices and estimates the chip's."""
     json: str = ""
-    """Of a plan with --compiler target: also write the numbers of every stage to this file."""
+    """Of a plan: also write the numbers of every stage to this file."""
     compiled: str = "auto"
     """Of a plan: `on` compiles the step and reads the program, `off` prints the estimates of the
     formulas alone, `auto` compiles unless that takes very long."""
@@ -90,10 +90,6 @@ class Launch(Join):
         require(
             self.compiler in COMPILERS,
             f"--compiler is {self.compiler}: use {', '.join(COMPILERS)}.",
-        )
-        require(
-            not self.json or self.compiler == "target",
-            "--json needs --compiler target.",
         )
         require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
         require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")

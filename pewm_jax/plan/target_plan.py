@@ -8,12 +8,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from pewm_jax import __version__
 from pewm_jax.config import Config, Launch
 from pewm_jax.io import atomic
 from pewm_jax.plan import target_compiler, topology
 from pewm_jax.plan.measure import MeshSizes
-from pewm_jax.plan.plan import flop, rate, size
+from pewm_jax.plan.plan import StagePlan, flop, rate, size
 from pewm_jax.plan.target_compiler import StageReport
 from pewm_jax.train import chips, sharding, stages
 from pewm_jax.train.log import duration
@@ -26,6 +28,8 @@ MEMORY = (
     ("peak", "peak_bytes"),
 )
 """Label and ``StageReport`` field of each line in the table of memory."""
+ESTIMATED = "Estimated from formulas and a program for CPUs; mfu is that of the predicted step."
+"""What is uncertain about the numbers of a plan without the chip's compiler."""
 
 
 def show(config: Config, launch: Launch, log: Callable[[str], None] = print) -> list[StageReport]:
@@ -65,6 +69,42 @@ def write(path: Path, reports: list[StageReport]) -> None:
         "stages": [dataclasses.asdict(report) for report in reports],
     }
     atomic.write_text(path, json.dumps(values, indent=2) + "\n")
+
+
+def estimate(plan: StagePlan) -> StageReport:
+    """Return the numbers of a stage that was not compiled for its chip, as a report."""
+    choice, compiled = plan.choice, plan.compiled
+    memory, time, count = choice.memory, choice.time, choice.mesh.devices
+    known = memory.temporary is not None
+    return StageReport(
+        name=plan.stage.name,
+        chip=plan.chip.name,
+        devices=count,
+        mesh=choice.mesh.sizes,
+        compiler={"name": "XLA for CPUs", "version": jax.__version__},
+        options={},
+        argument_bytes=memory.state,
+        temporary_bytes=memory.peak - memory.state if known else None,
+        output_bytes=None,
+        alias_bytes=None,
+        peak_bytes=memory.peak if known else None,
+        capacity_bytes=plan.chip.memory,
+        fits=choice.fits,
+        refusal="",
+        flops_needed=time.needed_flops / count,
+        flops_executed=time.executed_flops,
+        bytes=None,
+        kernels={},
+        collectives=[
+            {"kind": kind, "axis": axis, "bytes": sent} for (kind, axis), sent in time.sent.items()
+        ],
+        roofline_s=None,
+        bound="",
+        mfu=time.mfu,
+        trace_s=0.0,
+        compile_s=compiled.seconds if compiled else 0.0,
+        notes=[ESTIMATED],
+    )
 
 
 def lines(report: StageReport, title: str, clips: int) -> Iterator[str]:

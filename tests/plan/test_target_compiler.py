@@ -7,13 +7,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 from pewm_jax import presets
 from pewm_jax.config import ConfigError, Launch, UserError
-from pewm_jax.plan import chip_program, hlo, target_compiler, target_plan, topology
+from pewm_jax.nn import attention, target
+from pewm_jax.nn.target import Target
+from pewm_jax.plan import chip_program, hlo, plan, target_compiler, target_plan, topology
 from pewm_jax.plan.target_compiler import StageReport
-from pewm_jax.train import chips
+from pewm_jax.train import chips, flops
 
 ROOT = Path(__file__).parents[2]
 SMALL = ("--train.stage1.batch", "4", "--train.stage2.steps", "0", "--model.dtype", "bfloat16")
@@ -64,11 +68,35 @@ def test_without_its_compiler_a_chip_is_refused_in_one_sentence(monkeypatch, cap
     assert len(error.strip().splitlines()) == 1
 
 
-def test_flags_that_do_not_fit_together_are_refused():
+def test_an_unknown_compiler_is_refused():
     with pytest.raises(ConfigError, match="--compiler is gcc: use cpu, target"):
         Launch(compiler="gcc")
-    with pytest.raises(ConfigError, match="--json needs --compiler target"):
-        Launch(json="plan.json")
+
+
+def test_a_plan_without_the_chip_s_compiler_writes_its_estimates_in_the_same_form():
+    launch = Launch(plan=True, devices=1, chip="v5e", compiled="off")
+    plans = plan.show(presets.load("tiny"), launch, lambda _: None)
+    estimates = [target_plan.estimate(one) for one in plans]
+    assert [one.name for one in estimates] == ["stage1", "stage2"]
+    for one in estimates:
+        assert one.temporary_bytes is None, "not compiled"
+        assert 0 < one.argument_bytes < one.capacity_bytes
+        assert one.flops_executed > 0.99 * one.flops_needed > 0
+        json.dumps(dataclasses.asdict(one))
+
+
+def test_the_products_of_splash_attention_are_counted_with_their_padding():
+    shape = jax.ShapeDtypeStruct((2, 3, 500, 64), jnp.bfloat16)
+
+    def total(q, k, v):
+        return attention.attention(q, k, v).astype(jnp.float32).sum()
+
+    with target.use(Target("tpu")):
+        traced = jax.jit(jax.grad(total, (0, 1, 2))).trace(shape, shape, shape)
+    products = 2 + 3 + 4  # forward, queries, keys and values
+    expected = products * 2 * (2 * 3 * 512 * 512 * 128)
+    found = flops.executed(traced.jaxpr, "tpu").flops
+    assert found == {"attention": pytest.approx(expected, rel=1e-3)}
 
 
 REFUSALS = {
@@ -187,6 +215,75 @@ def test_communication_is_named_by_the_axes_of_the_mesh():
         {"kind": "all-reduce", "axis": "data+fsdp+context", "bytes": 8.0},
         {"kind": "all-reduce", "axis": "other", "bytes": 16.0},
     ]
+
+
+INDEPENDENT = """
+import functools, sys
+import jax, numpy as np
+from jax.experimental import topologies
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
+from pewm_jax import config, presets
+from pewm_jax.data import abstract
+from pewm_jax.nn import target
+from pewm_jax.train import stages, step
+from pewm_jax.worlds.pewm.world import STAGES
+import dataclasses
+
+settings = presets.load("tiny")
+settings = dataclasses.replace(
+    settings.with_model(dtype="bfloat16"),
+    train=dataclasses.replace(
+        settings.train,
+        stage1=dataclasses.replace(settings.train.stage1, batch=4),
+        stage2=dataclasses.replace(settings.train.stage2, steps=0),
+    ),
+)
+devices = topologies.get_topology_desc(platform="tpu", topology_name="v5e:2x2").devices
+mesh = Mesh(
+    np.array(devices).reshape(4, 1, 1, 1), config.AXES, axis_types=(AxisType.Auto,) * 4
+)
+everywhere, split = NamedSharding(mesh, P()), NamedSharding(mesh, P(("data", "fsdp")))
+stage, key = STAGES[0], jax.random.key(0)
+state = jax.eval_shape(functools.partial(step.create, settings, stage), key)
+clip = abstract.clip(settings, 4)
+place = lambda tree, where: jax.tree.map(
+    lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), tree
+)
+with jax.set_mesh(mesh), target.use(target.Target("tpu")):
+    function = jax.jit(
+        functools.partial(step.train_step, settings, stage),
+        out_shardings=(jax.tree.map(lambda _: everywhere, state), everywhere),
+        donate_argnums=0,
+    )
+    lowered = function.lower(place(state, everywhere), place(clip, split), place(key, everywhere))
+found = lowered.compile().memory_analysis()
+new = found.output_size_in_bytes - found.alias_size_in_bytes
+print(found.argument_size_in_bytes + found.temp_size_in_bytes + new)
+"""
+
+
+@pytest.mark.slow
+def test_the_peak_is_that_of_a_script_that_calls_the_compiler_itself(tmp_path):
+    try:
+        topology.require_compiler(chips.named("v5e"))
+    except UserError as error:
+        pytest.skip(str(error))
+    config = presets.load("tiny").with_model(dtype="bfloat16")
+    stages = {
+        "stage1": dataclasses.replace(config.train.stage1, batch=4),
+        "stage2": dataclasses.replace(config.train.stage2, steps=0),
+    }
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, **stages))
+    stage = target_compiler.compile_stage(config, "stage1", chips.named("v5e"), 4)
+    done = subprocess.run(
+        [sys.executable, "-c", INDEPENDENT],
+        env={**os.environ, **topology.ENVIRONMENT, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert stage.peak_bytes == pytest.approx(float(done.stdout.split()[-1]), rel=0.01)
 
 
 @pytest.mark.parametrize("chip", ["v5e", "h100"])
