@@ -28,7 +28,7 @@ from pewm_jax.plan import topology
 from pewm_jax.train import chips
 from pewm_jax.train.chips import Chip
 
-NO_TRITON = {"xla_gpu_enable_triton_gemm": False}
+NO_TRITON: dict[str, str | bool] = {"xla_gpu_enable_triton_gemm": False}
 """Options for programs with a matrix product for which no tiles are found without a device."""
 NO_TILES = "Couldn't find output tile sizes"
 """Part of the CUDA compiler's message about such a product."""
@@ -236,7 +236,8 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
         compile_s=0.0,
         notes=list(UNKNOWN),
     )
-    began, options = time.monotonic(), {}
+    options: dict[str, str | bool] = {}
+    began = time.monotonic()
     try:
         try:
             compiled = lowered.compile()
