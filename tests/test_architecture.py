@@ -1,6 +1,7 @@
 """Import rules: a package imports only lower packages, heavy libraries only in few files."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -257,3 +258,11 @@ def test_every_public_name_exists():
         "else: raise SystemExit('an unknown name must not resolve')"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+def test_one_file_asks_for_the_hardware_of_this_process():
+    """Kernels are chosen for a target, which need not be the machine that traces the program."""
+    asked = re.compile(r"default_backend|get_backend|local_devices\(\)\[0\]")
+    assert [place for place, path in PLACES.items() if asked.search(path.read_text())] == [
+        "nn/target"
+    ]

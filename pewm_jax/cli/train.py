@@ -26,6 +26,7 @@ EXAMPLES = {
     "plan": (
         "pewm_5b --devices 64 --chip h200",
         "pewm_2b --devices 8 --chip h100 --train.mesh.fsdp 8",
+        "pewm_2b --devices 8 --chip v5p --compiler target --json plan.json",
     ),
 }
 ABOUT = {
@@ -120,8 +121,15 @@ def run(chosen: Chosen, config: Config) -> None:
 def plan(chosen: Chosen, config: Config) -> None:
     """Print the predicted memory and time of a training on other hardware."""
     from pewm_jax.plan import plan as planning
+    from pewm_jax.plan import target_plan
 
-    planning.show(config, dataclasses.replace(chosen.launch, plan=True))
+    launch = dataclasses.replace(chosen.launch, plan=True)
+    if launch.compiler == "target":
+        target_plan.show(config, launch)
+        return
+    plans = planning.show(config, launch)
+    if launch.json:
+        target_plan.write(Path(launch.json), [target_plan.estimate(plan) for plan in plans])
 
 
 def _epilog(prog: str, examples: Sequence[str]) -> str:

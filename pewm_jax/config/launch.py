@@ -9,6 +9,8 @@ from pewm_jax.errors import require
 
 COMPILED = ("auto", "on", "off")
 """Whether a plan compiles the step."""
+COMPILERS = ("cpu", "target")
+"""Whose compiler a plan uses."""
 
 
 def is_address(text: str) -> bool:
@@ -66,7 +68,12 @@ class Launch(Join):
     devices: int = 8
     """Of a plan: number of devices."""
     chip: str = "h200"
-    """Of a plan: h100, h200, b200, v5p or v6e."""
+    """Of a plan: a100, h100, h200, b200, v4, v5e, v5p, v6e or tpu7x."""
+    compiler: str = "cpu"
+    """Of a plan: `target` compiles the step with the chip's own compiler, which needs the extra
+    plan-tpu or plan-cuda; `cpu` compiles it for virtual CPU devices and estimates the chip's."""
+    json: str = ""
+    """Of a plan: also write the numbers of every stage to this file."""
     compiled: str = "auto"
     """Of a plan: `on` compiles the step and reads the program, `off` prints the estimates of the
     formulas alone, `auto` compiles unless that takes very long."""
@@ -79,6 +86,10 @@ class Launch(Join):
         require(
             self.compiled in COMPILED,
             f"--compiled is {self.compiled}: use {', '.join(COMPILED)}.",
+        )
+        require(
+            self.compiler in COMPILERS,
+            f"--compiler is {self.compiler}: use {', '.join(COMPILERS)}.",
         )
         require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
         require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")

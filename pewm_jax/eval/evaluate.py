@@ -34,6 +34,7 @@ from pewm_jax.eval.runner import Methods, ModelRunner, print_now, workers
 from pewm_jax.eval.scoring import Scored, score_table
 from pewm_jax.io import atomic
 from pewm_jax.io.store import ResultCache, file_hash
+from pewm_jax.nn import target
 from pewm_jax.report.evaluation_page import Gallery, evaluation_page
 from pewm_jax.report.labels import score_lines, summary_lines
 from pewm_jax.report.pictures import ROWS, save_png
@@ -201,7 +202,7 @@ def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
     data_hash = file_hash(split / MANIFEST)
     metrics = select_metrics(
         config,
-        accelerator=jax.default_backend() != "cpu",
+        accelerator=target.current().platform != "cpu",
         ids=all(episodes[index].has_ids for index in range(len(episodes))),
     )
     validation = reproject.data_hash(config)

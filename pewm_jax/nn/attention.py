@@ -1,4 +1,4 @@
-"""Attention that never stores all logits: in blocks on a CPU, by cuDNN's kernel on a GPU.
+"""Attention that never stores all logits: in blocks on a CPU, by kernels on GPUs and TPUs.
 
 With a thousand tokens or more, the logits of all heads take hundreds of megabytes, and a CPU spends
 its time moving them. Computing one head and one block of queries at a time is the same arithmetic
@@ -6,6 +6,9 @@ and three times as fast there (1,370 tokens, 6 heads of 64). The backward pass k
 logarithm of each query's normaliser and recomputes the attention weights from it (FlashAttention,
 Dao et al. 2022). This saves memory and is faster than reading the weights back. Other platforms use
 the same formula without the loops.
+
+The target of the trace (``nn.target``) chooses the kernel: cuDNN's flash attention for NVIDIA GPUs
+in 16 bits, splash attention (``nn.splash``) for many tokens on TPUs.
 """
 
 from __future__ import annotations
@@ -19,14 +22,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.errors import UserError
-from pewm_jax.nn import placement
+from pewm_jax.nn import placement, splash
+from pewm_jax.nn import target as targets
 from pewm_jax.nn.layers import linear, merge_heads, split_heads
+from pewm_jax.nn.target import Target
 from pewm_jax.types import Array, Params
 
 LOGITS = 2**20
 """Logits held at once on a CPU: 4 MB in float32."""
 
-Implementation = Literal["auto", "xla", "cudnn"]
+Implementation = Literal["auto", "xla", "cudnn", "splash"]
+Kernel = Literal["formula", "cudnn", "splash"]
+"""What computes attention; the formula runs in blocks on a CPU."""
 
 
 def attention(
@@ -45,12 +52,12 @@ def attention(
         q_BKND: queries.
         k_BKMD: keys.
         v_BKMD: values.
-        implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs anywhere,
-            `auto` takes cudnn where it works.
+        implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `splash` is flash
+            attention on TPUs, `xla` runs anywhere, `auto` takes the best that works.
         real_M: indices of the keys that are not padding; None if all are real.
 
     Raises:
-        UserError: `cudnn` is asked for and cannot run here.
+        UserError: a kernel is asked for that the target or these arrays do not allow.
     """
 
     def alone(q: Array, k: Array, v: Array) -> Array:
@@ -66,20 +73,51 @@ def attention(
 def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implementation) -> Array:
     """Compute ``attention`` on one device."""
     batch, heads, queries, _ = q_BKND.shape
-    works = has_flash() and fits_flash(q_BKND)
-    if implementation == "cudnn" and not works:
-        raise UserError(
-            f"attention cudnn needs an NVIDIA GPU (Ampere or newer), 16 bits and heads of at most "
-            f"128 channels, a multiple of 8; here are {jax.default_backend()}, {q_BKND.dtype} and "
-            f"{q_BKND.shape[-1]}: choose auto or xla."
-        )
-    if works and implementation != "xla":
+    kernel = choose_kernel(targets.current(), q_BKND, k_BKMD, implementation)
+    if kernel == "splash":
+        return splash.splash(q_BKND, k_BKMD, v_BKMD)
+    if kernel == "cudnn":
         q, k, v = (x.swapaxes(1, 2) for x in (q_BKND, k_BKMD, v_BKMD))
         return flash(q, k, v, "cudnn").swapaxes(1, 2)
     logits = batch * queries * k_BKMD.shape[2]
     if heads * logits <= LOGITS:
         return plain_attention(q_BKND, k_BKMD, v_BKMD)
     return _attention(q_BKND, k_BKMD, v_BKMD, min(math.ceil(logits / LOGITS), queries))
+
+
+def choose_kernel(
+    target: Target, q_BKND: Any, k_BKMD: Any, implementation: Implementation = "auto"
+) -> Kernel:
+    """Return what computes attention on a target.
+
+    Args:
+        target: the hardware.
+        q_BKND: queries, or their shape and dtype.
+        k_BKMD: keys, or their shape and dtype.
+        implementation: as for ``attention``.
+
+    Raises:
+        UserError: a kernel is asked for that the target or these arrays do not allow.
+    """
+    *_, queries, channels = q_BKND.shape
+    if implementation == "xla":
+        return "formula"
+    if implementation == "splash":
+        if target.platform != "tpu":
+            raise UserError(
+                f"attention splash needs a TPU; this is {target.platform}: choose auto or xla."
+            )
+        return "splash"
+    if target.has_cudnn_attention and fits_flash(q_BKND):
+        return "cudnn"
+    if implementation == "cudnn":
+        raise UserError(
+            f"attention cudnn needs an NVIDIA GPU (Ampere or newer), 16 bits and heads of at most "
+            f"128 channels, a multiple of 8; here are {target.platform}, {q_BKND.dtype} and "
+            f"{channels}: choose auto or xla."
+        )
+    pays = target.platform == "tpu" and splash.pays(queries, k_BKMD.shape[2], channels)
+    return "splash" if pays else "formula"
 
 
 def multi_head_attention(params: Params, x_BND: Array, context_BME: Array, heads: int) -> Array:
@@ -126,15 +164,7 @@ def flash(q_BNKD: Array, k_BMKD: Array, v_BMKD: Array, implementation: Any) -> A
     return out[:, :queries]
 
 
-def has_flash() -> bool:
-    """Tell whether JAX runs on an NVIDIA GPU that has cuDNN's flash attention."""
-    if jax.default_backend() != "gpu":
-        return False
-    capability = str(getattr(jax.local_devices()[0], "compute_capability", ""))
-    return capability.partition(".")[0].isdigit() and float(capability) >= 8
-
-
-def fits_flash(q_BKND: Array) -> bool:
+def fits_flash(q_BKND: Any) -> bool:
     """Tell whether cuDNN's flash attention supports this dtype and head size."""
     channels = q_BKND.shape[-1]
     sixteen = q_BKND.dtype in (jnp.bfloat16, jnp.float16)

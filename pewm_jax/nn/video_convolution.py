@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax.nn import target
 from pewm_jax.types import Array, Params
 
 POINTS = (0.0, 1.0, -1.0, 0.5, -2.0)
@@ -110,11 +111,11 @@ def convolve_upsampled(params: Params, x_BTHWC: Array) -> Array:
 def form(config: Settings, dtype: jnp.dtype) -> str:
     """Return the form of the 3D convolutions: ``taps``, ``winograd`` or ``volume``.
 
-    ``auto`` depends on JAX's default backend while tracing.
+    ``auto`` depends on the target of the trace.
     """
     if config.convolution != "auto":
         return config.convolution
-    if jax.default_backend() != "cpu":
+    if target.current().platform != "cpu":
         return "volume"
     return "winograd" if dtype == jnp.float32 else "taps"
 

@@ -19,6 +19,8 @@ KINDS = ("all-gather", "reduce-scatter", "all-reduce", "all-to-all", "collective
 """The kinds of collective communication."""
 THROUGH = ("bitcast", "copy", "convert", "transpose", "reshape")
 """Operations that forward an array without using its values."""
+PRODUCTS = ("dot", "convolution")
+"""Operations that are matrix products or convolutions."""
 
 _CALLED = re.compile(r"\b(?:calls|to_apply|body)=%?([\w.$-]+)")
 _BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
@@ -160,7 +162,7 @@ def read(text: str) -> Program:
             if (flops := _flops(line, lines)) > 0:
                 products.append(Product(line.label, flops))
             elif line.opcode.removesuffix("-start") in KINDS:
-                collectives += _collectives(line, lines, functools.partial(only_sliced, name))
+                collectives += collectives_of(line, lines, functools.partial(only_sliced, name))
             for (inner_products, inner_collectives), trips in _inside(line, walk):
                 if trips == 0 and (inner_products or inner_collectives):
                     unknown.append(line.label)
@@ -196,7 +198,7 @@ def _inside(line: Line, walk) -> Iterator[tuple]:
 def _flops(line: Line, lines: dict[str, Line]) -> float:
     """Return the FLOPs of one instruction, without the computations it calls."""
     matmul = line.opcode == "custom-call" and "matmul" in line.rest
-    if line.opcode not in ("dot", "convolution") and not matmul:
+    if line.opcode not in PRODUCTS and not matmul:
         return 0.0
     shapes = [dims(lines[name].shape) for name in line.operands[:2]]
     out = math.prod(dims(line.shape))
@@ -212,7 +214,7 @@ def _flops(line: Line, lines: dict[str, Line]) -> float:
     return 2.0 * out * summed
 
 
-def _collectives(
+def collectives_of(
     line: Line, lines: dict[str, Line], only_sliced: Callable[[str], bool]
 ) -> Iterator[Collective]:
     """Yield a ``Collective`` for each operand of a communication instruction.

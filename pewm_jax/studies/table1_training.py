@@ -36,6 +36,7 @@ from pewm_jax.io import atomic, weights
 from pewm_jax.io.store import file_hash, inputs_hash, make_once
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models.dinov2 import model as dinov2
+from pewm_jax.nn import target
 from pewm_jax.studies.table1_rows import Row
 from pewm_jax.train import loop, sharding
 from pewm_jax.train.runs import WEIGHTS
@@ -294,7 +295,7 @@ def _model(study: Study, row: Row) -> str:
 
 def clock() -> Callable[[], float]:
     """Return the clock for training time: processor time, or wall-clock time on an accelerator."""
-    return time.process_time if jax.default_backend() == "cpu" else time.perf_counter
+    return time.process_time if target.current().platform == "cpu" else time.perf_counter
 
 
 def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:

@@ -47,6 +47,17 @@ class Chip:
 
 CHIPS = (
     Chip(
+        name="a100",
+        device_kind=r"A100|(NVIDIA )?A100( SXM4)? 80GB",
+        flops=312e12,
+        memory=80e9,
+        bandwidth=2039e9,
+        island=8,
+        link=300e9,
+        network=25e9,
+        source="NVIDIA A100 data sheet (SXM, 80 GB); DGX A100: 8 × 200 Gb/s",
+    ),
+    Chip(
         name="h100",
         device_kind=r"(NVIDIA )?H100( 80GB HBM3| SXM5?)?",
         flops=989.4e12,
@@ -80,8 +91,30 @@ CHIPS = (
         source="NVIDIA DGX B200 data sheet: an eighth of the system; 8 × 400 Gb/s",
     ),
     # A collective along one mesh axis uses one axis of the torus in both directions: two of the
-    # 6 (v5p) or 4 (v6e) links. The links share the bandwidth stated per chip, which counts both
-    # directions.
+    # 6 (v4, v5p, tpu7x) or 4 (v5e, v6e) links. The links share the bandwidth stated per chip, which
+    # counts both directions.
+    Chip(
+        name="v4",
+        device_kind=r"TPU v4|v4",
+        flops=275e12,
+        memory=32 * 2**30,
+        bandwidth=1228e9,
+        island=4096,
+        link=600e9 / 2 / 3,
+        network=50e9 / 8,
+        source="Google Cloud, TPU v4: 2400 Gb/s each way over 6 links; network taken from v5p",
+    ),
+    Chip(
+        name="v5e",
+        device_kind=r"TPU v5( lite|e)|v5e",
+        flops=197e12,
+        memory=16 * 2**30,
+        bandwidth=819e9,
+        island=256,
+        link=400e9 / 2 / 2,
+        network=6.4e12 / 256 / 8,
+        source="Google Cloud, TPU v5e: 400 GB/s over 4 links both ways, network 6.4 Tb/s a pod",
+    ),
     Chip(
         name="v5p",
         device_kind=r"TPU v5p?|v5p",
@@ -97,12 +130,24 @@ CHIPS = (
         name="v6e",
         device_kind=r"TPU v6( lite|e)|v6e|trillium",
         flops=918e12,
-        memory=32e9,
+        memory=32 * 2**30,
         bandwidth=1638e9,
         island=256,
         link=800e9 / 2 / 2,
         network=100e9 / 8,
         source="Google Cloud, TPU v6e: 800 GB/s over 4 links both ways, network 100 Gb/s per chip",
+    ),
+    # JAX has two devices for each chip.
+    Chip(
+        name="tpu7x",
+        device_kind=r"TPU ?7x|TPU v7x?|tpu7x|ironwood",
+        flops=2307e12 / 2,
+        memory=192 * 2**30 / 2,
+        bandwidth=7380e9 / 2,
+        island=2 * 9216,
+        link=1200e9 / 2 / 3 / 2,
+        network=100e9 / 8 / 2,
+        source="Google Cloud, TPU7x: 1200 GB/s over 6 links both ways, network 100 Gb/s a chip",
     ),
 )
 """All known chips."""

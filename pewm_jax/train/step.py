@@ -22,6 +22,7 @@ from jax.sharding import Mesh
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.io import tree
+from pewm_jax.nn import target
 from pewm_jax.train import optimizer, sharding
 from pewm_jax.train.stages import Stage
 from pewm_jax.types import Array, Clip, Params
@@ -248,9 +249,9 @@ def trace_step(
     Args:
         config: the experiment.
         stage: the stage.
-        mesh: the devices.
+        mesh: the devices; those of a described topology need not exist.
         clip: a batch, or the shapes of one.
-        extra: from ``load_extra_weights``.
+        extra: from ``load_extra_weights``, or its shapes.
     """
     state = abstract_state(config, stage, mesh)
     everywhere = sharding.replicated(mesh)
@@ -266,7 +267,8 @@ def trace_step(
         donate_argnums=0,
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
-    with jax.set_mesh(mesh):  # read by ``nn.placement``
+    kind = target.of_devices(mesh.devices.ravel().tolist())
+    with jax.set_mesh(mesh), target.use(kind):  # read by ``nn.placement`` and the kernels
         return step.trace(state, batch, abstract_key, *extra)
 
 

@@ -1,4 +1,4 @@
-"""Attention in pieces is attention, whatever the number of pieces."""
+"""Attention in pieces and by kernels is attention, whatever the sizes and the hardware."""
 
 import functools
 import types
@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import UserError
+from pewm_jax.models.svd import layers as svd
 from pewm_jax.nn import attention as blocked_attention
+from pewm_jax.nn import splash, target
+from pewm_jax.nn.target import Target
+
+H100, A100, T4, V5P = (
+    *(Target("cuda", capability) for capability in ((9, 0), (8, 0), (7, 5))),
+    Target("tpu"),
+)
 
 
 def inputs(batch=2, heads=3, queries=13, keys=11, channels=8):
@@ -100,33 +108,38 @@ def test_flash_attention_is_refused_where_there_is_none_and_taken_where_there_is
         asked.append((q.shape, implementation, {name: int(x[0]) for name, x in lengths.items()}))
         return q + v[:, :1] * k[:, :1]
 
-    monkeypatch.setattr(blocked_attention, "has_flash", lambda: True)
     monkeypatch.setattr(jax.nn, "dot_product_attention", flash)
     half = [x.astype(jnp.bfloat16) for x in (q, k, v)]
-    assert blocked_attention.attention(*half).shape == q.shape
-    blocked_attention.attention(*half, "xla")
-    blocked_attention.attention(q, k, v)
+    with target.use(H100):
+        assert blocked_attention.attention(*half).shape == q.shape
+        blocked_attention.attention(*half, "xla")
+        blocked_attention.attention(q, k, v)
     lengths = {"query_seq_lengths": 13, "key_value_seq_lengths": 11}
     assert asked == [((2, 14, 3, 8), "cudnn", lengths)], "16 bits alone, tokens in front of heads"
+
+
+@pytest.fixture
+def has_cudnn(monkeypatch):
+    """Name a version of cuDNN, for which JAX asks while tracing."""
+    from jax._src.cudnn import fused_attention_stablehlo as cudnn
+
+    version = types.SimpleNamespace(cudnn_get_version=lambda: 91000)
+    monkeypatch.setattr(cudnn, "cuda_versions", version)
 
 
 ODD = [(9, 9), (9, 10), (10, 9), (1, 1), (17, 2), (8, 8)]
 
 
 @pytest.mark.parametrize(("queries", "keys"), ODD)
-def test_cudnn_traces_gradients_of_any_length(monkeypatch, queries, keys):
+def test_cudnn_traces_gradients_of_any_length(has_cudnn, queries, keys):
     """Stable Video Diffusion attends over 9 frames; cuDNN's gradient wants even lengths."""
-    from jax._src.cudnn import fused_attention_stablehlo as cudnn
-
-    version = types.SimpleNamespace(cudnn_get_version=lambda: 91000)
-    monkeypatch.setattr(cudnn, "cuda_versions", version)  # JAX asks for it while tracing
-    monkeypatch.setattr(blocked_attention, "has_flash", lambda: True)
     half = [x.astype(jnp.bfloat16) for x in inputs(queries=queries, keys=keys)]
 
     def total(*x):
         return blocked_attention.attention(*x).astype(jnp.float32).sum()
 
-    traced = str(jax.make_jaxpr(jax.grad(total, (0, 1, 2)))(*half))
+    with target.use(H100):
+        traced = str(jax.make_jaxpr(jax.grad(total, (0, 1, 2)))(*half))
     assert "dot_product_attention_bwd_wrapper" in traced
 
 
@@ -148,3 +161,124 @@ def test_padding_for_odd_lengths_changes_neither_results_nor_gradients(queries, 
     )
     for got, want in zip(slopes(padded), slopes(blocked_attention.plain_attention), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+
+
+def test_the_nine_frames_of_svd_are_traced_for_a_gpu_with_gradients(has_cudnn):
+    params = {
+        "to_q": {"kernel": jnp.ones((64, 64))},
+        "to_k": {"kernel": jnp.ones((64, 64))},
+        "to_v": {"kernel": jnp.ones((64, 64))},
+        "to_out": {"kernel": jnp.ones((64, 64)), "bias": jnp.zeros(64)},
+    }
+    frames = jax.ShapeDtypeStruct((2, 9, 4, 64), jnp.bfloat16)
+
+    def total(params, x):
+        return svd._over_frames(params, x, heads=2).astype(jnp.float32).sum()
+
+    with target.use(H100):
+        traced = str(jax.make_jaxpr(jax.grad(total))(params, frames))
+    assert "dot_product_attention_bwd_wrapper" in traced
+
+
+def shape(tokens, channels=64, dtype=jnp.bfloat16):
+    return jax.ShapeDtypeStruct((1, 2, tokens, channels), dtype)
+
+
+@pytest.mark.parametrize(
+    ("where", "tokens", "channels", "dtype", "kernel"),
+    [
+        (H100, 9, 64, jnp.bfloat16, "cudnn"),
+        (A100, 4096, 128, jnp.float16, "cudnn"),
+        (A100, 4096, 64, jnp.float32, "formula"),
+        (A100, 4096, 512, jnp.bfloat16, "formula"),
+        (T4, 4096, 64, jnp.bfloat16, "formula"),
+        (V5P, 3298, 64, jnp.bfloat16, "splash"),
+        (V5P, 3298, 128, jnp.float32, "splash"),
+        (V5P, 9, 64, jnp.bfloat16, "formula"),
+        (V5P, 4096, 512, jnp.bfloat16, "formula"),
+        (Target("cpu"), 4096, 64, jnp.bfloat16, "formula"),
+    ],
+)
+def test_the_target_chooses_the_kernel(where, tokens, channels, dtype, kernel):
+    q = shape(tokens, channels, dtype)
+    assert blocked_attention.choose_kernel(where, q, q) == kernel
+    assert blocked_attention.choose_kernel(where, q, q, "xla") == "formula"
+
+
+def test_few_keys_or_few_queries_need_no_kernel_on_a_tpu():
+    for queries, keys in ((4096, 16), (16, 4096)):
+        assert blocked_attention.choose_kernel(V5P, shape(queries), shape(keys)) == "formula"
+    assert blocked_attention.choose_kernel(V5P, shape(3072), shape(512)) == "splash"
+
+
+def test_splash_attention_is_refused_where_there_is_no_tpu():
+    with pytest.raises(UserError, match="splash needs a TPU; this is cpu"):
+        blocked_attention.attention(*inputs(), "splash")
+
+
+def test_one_function_is_traced_once_for_every_target():
+    seen = []
+
+    @jax.jit
+    def function(x):
+        seen.append(target.current())
+        return x
+
+    for where in (V5P, H100, V5P, None):
+        with target.use(where):
+            function(1.0)
+    assert seen == [V5P, H100, target.of_devices()]
+
+
+def test_a_program_for_tpus_is_traced_and_lowered_on_any_host():
+    half = [x.astype(jnp.bfloat16) for x in inputs(1, 2, 300, 260, 64)]
+
+    def total(*x):
+        return blocked_attention.attention(*x).astype(jnp.float32).sum()
+
+    with target.use(V5P):
+        traced = jax.jit(jax.grad(total, (0, 1, 2))).trace(*half)
+        text = traced.lower(lowering_platforms=("tpu",)).as_text()
+    assert text.count("custom_call @tpu_custom_call") == 3, "forward, queries, keys with values"
+
+
+def reference(q, k, v):
+    """Attention in NumPy's order of operations, in float32."""
+    q, k, v = (x.astype(jnp.float32) for x in (q, k, v))
+    logits = jnp.einsum("bknd,bkmd->bknm", q, k, precision="highest") / q.shape[-1] ** 0.5
+    return jnp.einsum("bknm,bkmd->bknd", jax.nn.softmax(logits, -1), v, precision="highest")
+
+
+IN_SPLASH = [(128, 128, 128), (13, 11, 8), (130, 257, 64), (300, 384, 80), (257, 16, 64)]
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+@pytest.mark.parametrize(("queries", "keys", "channels"), IN_SPLASH)
+def test_splash_attention_equals_the_reference_forward_and_backward(queries, keys, channels, dtype):
+    # Queries and keys of variance 1, as after their normalisation in the networks.
+    q, k, v = (x.astype(dtype) / 2 for x in inputs(2, 2, queries, keys, channels))
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=q.shape), dtype)
+
+    def total(attend):
+        def function(*x):
+            out = attend(*x)
+            return (out.astype(jnp.float32) * weight).sum(), out
+
+        return jax.jit(jax.value_and_grad(function, (0, 1, 2), has_aux=True))(q, k, v)
+
+    (_, got), slopes = total(functools.partial(splash.splash, interpret=True))
+    (_, want), exact = total(reference)
+    assert got.dtype == dtype
+    most = 1e-5 if dtype == jnp.float32 else 2e-3
+    for one, other in ((got, want), *zip(slopes, exact, strict=True)):
+        error = np.asarray(one, np.float32) - np.asarray(other, np.float32)
+        largest = np.abs(np.asarray(other, np.float32)).max()
+        # The rounding of a single result to bfloat16 is up to 4e-3 of it.
+        assert np.sqrt(np.square(error).mean()) <= most * largest
+        assert np.abs(error).max() <= 5 * most * largest
+
+
+def test_tiles_waste_little():
+    for tokens in (*range(1, 700), 3298, 17776):
+        padded = -(-tokens // splash.tile(tokens)) * splash.tile(tokens)
+        assert padded - tokens < 256 or padded <= 1.2 * tokens

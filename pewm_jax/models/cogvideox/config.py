@@ -69,9 +69,9 @@ class DiTConfig:
     """Divisor of row and column positions in `sincos`."""
     temporal_interpolation: float = 1.0
     """Divisor of time positions in `sincos`."""
-    attention: Literal["auto", "xla", "cudnn"] = "auto"
-    """The attention kernel: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `xla` runs
-    anywhere, `auto` uses cudnn if it can."""
+    attention: Literal["auto", "xla", "cudnn", "splash"] = "auto"
+    """The attention kernel: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `splash` is flash
+    attention on TPUs, `xla` runs anywhere, `auto` uses the best kernel of the hardware."""
     remat: bool = False
     """Recompute activations in the backward pass: less memory, about a third more time."""
 

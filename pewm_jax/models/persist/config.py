@@ -25,9 +25,10 @@ class BlocksConfig:
     gates: Literal["zero", "open"] = "zero"
     """Initial values of the modulation's gates. `zero`: every block is the identity, as
     published. `open`: 1, with which small networks learn faster."""
-    attention: Literal["auto", "xla", "cudnn"] = "auto"
+    attention: Literal["auto", "xla", "cudnn", "splash"] = "auto"
     """The kernel of attention inside of a frame and to pixels: `cudnn` is flash attention on NVIDIA
-    GPUs in 16 bits, `xla` runs anywhere, `auto` uses cudnn if it can."""
+    GPUs in 16 bits, `splash` is flash attention on TPUs, `xla` runs anywhere, `auto` uses the best
+    kernel of the hardware."""
     remat: bool = False
     """Recompute activations in the backward pass: less memory, about a third more time."""
 

@@ -1,0 +1,385 @@
+"""Compile a stage's real training step with the compiler of a chip that is not present.
+
+The compilation runs in a process of its own, which ``compile_stage`` starts: the compilers read
+environment variables and hold gigabytes. The process traces the step from shapes on a described
+topology (``topology``), compiles it and reports what the compiler decided. Nothing runs, so times
+are bounds from data sheets and not measurements.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import itertools
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from pewm_jax.config import AXES, Config, serialize
+from pewm_jax.errors import UserError
+from pewm_jax.plan import topology
+from pewm_jax.train import chips
+from pewm_jax.train.chips import Chip
+
+NO_TRITON: dict[str, str | bool] = {"xla_gpu_enable_triton_gemm": False}
+"""Options for programs with a matrix product for which no tiles are found without a device."""
+NO_TILES = "Couldn't find output tile sizes"
+"""Part of the CUDA compiler's message about such a product."""
+UNKNOWN = (
+    "Nothing runs: the time is a lower bound from data sheets, without waiting or latency.",
+    "Without a device there is no autotuning, so kernels on the device may differ.",
+    "Memory of the runtime and of other processes is not included.",
+)
+"""What such a plan cannot know."""
+
+_OOM = re.compile(
+    r"(?:total memory required[^()]*\(|Used )([\d.]+)([KMGT]?).*?"
+    r"(?:available HBM \(|of )([\d.]+)([KMGT]?)",
+    re.DOTALL,
+)
+_UNITS = {"": 1.0, "K": 2.0**10, "M": 2.0**20, "G": 2.0**30, "T": 2.0**40}
+
+
+@dataclasses.dataclass(frozen=True)
+class StageReport:
+    """What a chip's compiler says about one stage; bytes and FLOPs are of one device and step.
+
+    Attributes:
+        name: the stage.
+        chip: the kind of device.
+        devices: number of devices.
+        mesh: devices along each mesh axis.
+        compiler: its name and version.
+        options: compiler options that differ from the defaults.
+        argument_bytes: state and batch.
+        temporary_bytes: temporary memory; of a program that does not fit, what it would need.
+        output_bytes: results, including those in the memory of arguments.
+        alias_bytes: results in the memory of arguments.
+        peak_bytes: memory of the program: arguments, temporary memory and new results.
+        capacity_bytes: memory that a program may use.
+        fits: whether it suffices.
+        refusal: the compiler's reason if it refused the program.
+        flops_needed: FLOPs that the mathematics needs.
+        flops_executed: FLOPs with recomputation and padding.
+        bytes: bytes read from and written to the device's memory.
+        kernels: kind → name of a kernel → launches.
+        collectives: kind, mesh axis and bytes that a device sends.
+        roofline_s: lower bound of the time of a step.
+        bound: what bounds it: flops, bytes or collectives.
+        mfu: needed FLOPs over the peak FLOPs in that time.
+        trace_s: seconds of tracing and lowering.
+        compile_s: seconds of compilation.
+        notes: what is uncertain about the numbers.
+    """
+
+    name: str
+    chip: str
+    devices: int
+    mesh: dict[str, int]
+    compiler: dict[str, str]
+    options: dict[str, Any]
+    argument_bytes: float | None
+    temporary_bytes: float | None
+    output_bytes: float | None
+    alias_bytes: float | None
+    peak_bytes: float | None
+    capacity_bytes: float
+    fits: bool
+    refusal: str
+    flops_needed: float
+    flops_executed: float
+    bytes: float | None
+    kernels: dict[str, dict[str, int]]
+    collectives: list[dict[str, Any]]
+    roofline_s: float | None
+    bound: str
+    mfu: float | None
+    trace_s: float
+    compile_s: float
+    notes: list[str]
+
+
+def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> StageReport:
+    """Compile a stage in a process of its own.
+
+    Args:
+        config: the experiment.
+        stage: the name of the stage.
+        chip: the kind of device.
+        devices: number of devices.
+
+    Raises:
+        UserError: the compiler is not installed, or it fails for another reason than memory.
+    """
+    topology.require_compiler(chip)
+    request = {
+        "config": serialize.to_dict(config),
+        "plugins": _plugins(config),
+        "stage": stage,
+        "chip": chip.name,
+        "devices": devices,
+    }
+    with tempfile.TemporaryDirectory(prefix="pewm-plan-") as folder:
+        asked, answered = Path(folder) / "request.json", Path(folder) / "report.json"
+        asked.write_text(json.dumps(request))
+        here = str(Path(__file__).parents[2])
+        path = os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH", ""))))
+        done = subprocess.run(  # noqa: S603 - this library's own module
+            [sys.executable, "-m", "pewm_jax.plan.target_compiler", str(asked), str(answered)],
+            env={**os.environ, **topology.ENVIRONMENT, "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+        if not answered.exists():
+            lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
+            raise UserError(f"The compiler of {chip.name} failed on {stage}: {lines[-1]}")
+        answer = json.loads(answered.read_text())
+    if "error" in answer:
+        raise UserError(answer["error"])
+    return StageReport(**answer)
+
+
+def _plugins(config: Any) -> list[tuple[str, str]]:
+    """Return name and file of the modules outside the library that define parts of a config."""
+    found: dict[str, str] = {}
+    queue = [config]
+    while queue:
+        value = queue.pop()
+        name = type(value).__module__
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file and not name.startswith("pewm_jax."):
+            found[name] = file
+        queue += [
+            part
+            for field in dataclasses.fields(value)
+            if dataclasses.is_dataclass(part := getattr(value, field.name))
+        ]
+    return list(found.items())
+
+
+def main(asked: str, answered: str) -> None:
+    """Answer a request of ``compile_stage``: read its file and write the report's."""
+    request = json.loads(Path(asked).read_text())
+    try:
+        for name, file in request["plugins"]:
+            _load(name, file)
+        config = serialize.from_dict(Config, request["config"])
+        chip = chips.named(request["chip"])
+        answer = dataclasses.asdict(_report(config, request["stage"], chip, request["devices"]))
+    except UserError as error:
+        answer = {"error": str(error)}
+    Path(answered).write_text(json.dumps(answer))
+
+
+def _load(name: str, file: str) -> None:
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None
+    assert spec.loader is not None
+    sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sys.modules[name])
+
+
+def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageReport:
+    """Trace and compile a stage, in the process for it."""
+    import jax  # noqa: PLC0415 - only this process uses JAX
+
+    from pewm_jax.data import abstract  # noqa: PLC0415
+    from pewm_jax.plan import chip_program, measure, suggest  # noqa: PLC0415
+    from pewm_jax.train import sharding, stages, step  # noqa: PLC0415
+
+    (stage,) = (one for one in stages.planned(config) if one.name == stage_name)
+    devices = topology.devices(chip, count)
+    mesh = sharding.make_mesh(devices, config.train.mesh)
+    sizes = measure.MeshSizes(**{name: mesh.shape[name] for name in AXES})
+    clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
+    given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
+    given = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), given)
+    began = time.monotonic()
+    traced = step.trace_step(config, stage, mesh, clip, given)
+    lowered = traced.lower()
+    trace_s = time.monotonic() - began
+    work = measure.work_of(config, stage, traced, chip)
+    capacity = topology.capacity(chip)
+    report = StageReport(
+        name=stage.name,
+        chip=chip.name,
+        devices=count,
+        mesh=sizes.sizes,
+        compiler=topology.compiler(chip),
+        options={},
+        argument_bytes=suggest.memory_of(config, stage, sizes).state,
+        temporary_bytes=None,
+        output_bytes=None,
+        alias_bytes=None,
+        peak_bytes=None,
+        capacity_bytes=capacity,
+        fits=False,
+        refusal="",
+        flops_needed=work.needed.total / count,
+        flops_executed=sum(work.on_device(sizes).values()),
+        bytes=None,
+        kernels={},
+        collectives=[],
+        roofline_s=None,
+        bound="",
+        mfu=None,
+        trace_s=trace_s,
+        compile_s=0.0,
+        notes=list(UNKNOWN),
+    )
+    options: dict[str, str | bool] = {}
+    began = time.monotonic()
+    try:
+        try:
+            compiled = lowered.compile()
+        except jax.errors.JaxRuntimeError as error:
+            if NO_TILES not in str(error):
+                raise
+            options = NO_TRITON
+            compiled = lowered.compile(compiler_options=options)
+    except jax.errors.JaxRuntimeError as error:
+        return _refused(report, str(error), time.monotonic() - began, options)
+    memory: Any = compiled.memory_analysis()
+    arguments, temporary = measure.device_memory(compiled)
+    notes: list[str] = list(UNKNOWN)
+    report = dataclasses.replace(
+        report,
+        options=dict(options),
+        argument_bytes=arguments,
+        temporary_bytes=float(memory.temp_size_in_bytes),
+        output_bytes=float(memory.output_size_in_bytes),
+        alias_bytes=float(memory.alias_size_in_bytes),
+        peak_bytes=arguments + temporary,
+        fits=arguments + temporary <= capacity,
+        compile_s=time.monotonic() - began,
+    )
+    try:
+        program = chip_program.read(compiled.as_text() or "")
+    except jax.errors.JaxRuntimeError:
+        notes.append("The compiler does not print this program: its kernels are unknown.")
+        return dataclasses.replace(_timed(report, config, chip, 0.0), notes=notes)
+    if program.unknown:
+        notes.append(f"Loops of unknown length count as one run: {', '.join(program.unknown)}.")
+    if options:
+        notes.append("Compiled without Triton's matrix products, which need a device for one.")
+    report = dataclasses.replace(
+        report,
+        bytes=program.bytes,
+        kernels=program.kernels,
+        collectives=_along_axes(program.collectives, sizes.sizes),
+        notes=notes,
+    )
+    return _timed(report, config, chip, _link_seconds(program.collectives, chip))
+
+
+def _refused(
+    report: StageReport, message: str, seconds: float, options: dict[str, Any]
+) -> StageReport:
+    """Return the report of a program that the compiler refuses for its memory.
+
+    Raises:
+        UserError: it refuses for another reason.
+    """
+    sentence = " ".join(message.split())
+    if "RESOURCE_EXHAUSTED" not in message:
+        raise UserError(f"The compiler of {report.chip} failed on {report.name}: {sentence[:400]}")
+    needed, available = parse_refusal(message)
+    peak = needed
+    if needed is not None and "temporaries" in message:  # without the state and the batch
+        peak = needed + (report.argument_bytes or 0.0)
+    return dataclasses.replace(
+        report,
+        options=dict(options),
+        fits=False,
+        temporary_bytes=needed,
+        peak_bytes=peak,
+        capacity_bytes=available or report.capacity_bytes,
+        refusal=sentence[:400],
+        compile_s=seconds,
+    )
+
+
+def parse_refusal(message: str) -> tuple[float | None, float | None]:
+    """Return the bytes that a refused program needs, and those that there are, if it says so."""
+    found = _OOM.search(message)
+    if found is None:
+        return None, None
+    needed, available = (float(found[k]) * _UNITS[found[k + 1]] for k in (1, 3))
+    return needed, available
+
+
+def _timed(report: StageReport, config: Config, chip: Chip, link_s: float) -> StageReport:
+    """Add the bound of the time."""
+    peak = chip.flops if config.model.dtype == "bfloat16" else chip.flops / 2
+    seconds = {
+        "flops": report.flops_executed / peak,
+        "bytes": (report.bytes or 0.0) / chip.bandwidth,
+        "collectives": link_s,
+    }
+    bound = max(seconds, key=lambda name: seconds[name])
+    return dataclasses.replace(
+        report,
+        roofline_s=seconds[bound],
+        bound=bound,
+        mfu=report.flops_needed / (seconds[bound] * chip.flops),
+    )
+
+
+def _link_seconds(collectives: Any, chip: Chip) -> float:
+    """Return the seconds in which a device sends everything, one collective after the other."""
+    from pewm_jax.plan import suggest  # noqa: PLC0415 - only this process uses JAX
+
+    return math.fsum(
+        item.sent / suggest.rate(item.group, chip) for item in collectives if len(item.group) > 1
+    )
+
+
+def _along_axes(collectives: Any, sizes: dict[str, int]) -> list[dict[str, Any]]:
+    """Sum the communication of each kind along each axis of the mesh, or along several."""
+    groups = _groups(sizes)
+    sent: dict[tuple[str, str], float] = {}
+    for item in collectives:
+        axis = groups.get(tuple(sorted(item.group)), "other")
+        key = item.kind, axis
+        sent[key] = sent.get(key, 0.0) + item.sent
+    return [
+        {"kind": kind, "axis": axis, "bytes": size}
+        for (kind, axis), size in sorted(sent.items())
+        if size
+    ]
+
+
+def _groups(sizes: dict[str, int]) -> dict[tuple[int, ...], str]:
+    """Return the mesh axes along which each group of devices lies, joined by ``+``."""
+    split = [name for name, size in sizes.items() if size > 1]
+    strides = {
+        name: math.prod(list(sizes.values())[place + 1 :]) for place, name in enumerate(sizes)
+    }
+    found: dict[tuple[int, ...], str] = {}
+    for count in range(1, len(split) + 1):
+        for axes in itertools.combinations(split, count):
+            others = [name for name in split if name not in axes]
+            along, across = (
+                [
+                    sum(place * strides[name] for place, name in zip(places, names, strict=True))
+                    for places in itertools.product(*(range(sizes[name]) for name in names))
+                ]
+                for names in (axes, others)
+            )
+            for start in across:
+                group = tuple(sorted(start + step for step in along))
+                found.setdefault(group, "+".join(axes))
+    return found
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,316 @@
+"""`--compiler target`: described devices, reading the chip's program, refusals and the command."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from pewm_jax import presets
+from pewm_jax.config import ConfigError, Launch, UserError
+from pewm_jax.nn import attention, target
+from pewm_jax.nn.target import Target
+from pewm_jax.plan import chip_program, hlo, plan, target_compiler, target_plan, topology
+from pewm_jax.plan.target_compiler import StageReport
+from pewm_jax.train import chips, flops
+
+ROOT = Path(__file__).parents[2]
+SMALL = ("--train.stage1.batch", "4", "--train.stage2.steps", "0", "--model.dtype", "bfloat16")
+
+
+@pytest.mark.parametrize(
+    ("chip", "count", "name"),
+    [
+        ("v4", 8, "v4:2x2x2"),
+        ("v5e", 1, "v5e:1x1"),
+        ("v5e", 8, "v5e:2x4"),
+        ("v5e", 256, "v5e:16x16"),
+        ("v5p", 4, "v5p:2x2x1"),
+        ("v5p", 64, "v5p:4x4x4"),
+        ("v6e", 16, "v6e:4x4"),
+        ("tpu7x", 8, "tpu7x:2x2x1"),
+        ("tpu7x", 16, "tpu7x:2x2x2"),
+    ],
+)
+def test_tpus_are_described_by_the_topology_closest_to_a_cube(chip, count, name):
+    assert topology.tpu_topology(chips.named(chip), count) == name
+
+
+def test_numbers_of_devices_that_no_topology_has_are_refused():
+    for chip, count in (("v5p", 7), ("tpu7x", 9), ("v6e", 6)):
+        with pytest.raises(UserError, match="no topology of that many"):
+            topology.tpu_topology(chips.named(chip), count)
+
+
+def test_every_chip_has_a_capacity_near_its_memory_and_gpus_a_description():
+    for chip in chips.CHIPS:
+        assert topology.capacity(chip) == pytest.approx(chip.memory, rel=0.1)
+    assert {chip.name for chip in chips.CHIPS if chip.platform == "cuda"} == set(topology.GPUS)
+    text = topology.target_config(topology.GPUS["h100"])
+    assert "core_count: 132 " in text
+    assert "cuda_compute_capability { major: 9 }" in text
+    assert 'device_description_str: "NVIDIA H100 80GB HBM3"' in text
+
+
+@pytest.mark.parametrize(("chip", "extra"), [("v5e", "plan-tpu"), ("b200", "plan-cuda")])
+def test_without_its_compiler_a_chip_is_refused_in_one_sentence(monkeypatch, capsys, chip, extra):
+    from pewm_jax.cli import main
+
+    monkeypatch.setattr(topology, "_versions", lambda _: {})
+    assert main.main(["plan", "tiny", "--chip", chip, "--compiler", "target"]) == 2
+    error = capsys.readouterr().err
+    assert f"'pewm-jax[{extra}]'" in error
+    assert len(error.strip().splitlines()) == 1
+
+
+def test_an_unknown_compiler_is_refused():
+    with pytest.raises(ConfigError, match="--compiler is gcc: use cpu, target"):
+        Launch(compiler="gcc")
+
+
+def test_a_plan_without_the_chip_s_compiler_writes_its_estimates_in_the_same_form():
+    launch = Launch(plan=True, devices=1, chip="v5e", compiled="off")
+    plans = plan.show(presets.load("tiny"), launch, lambda _: None)
+    estimates = [target_plan.estimate(one) for one in plans]
+    assert [one.name for one in estimates] == ["stage1", "stage2"]
+    for one in estimates:
+        assert one.temporary_bytes is None, "not compiled"
+        assert 0 < one.argument_bytes < one.capacity_bytes
+        assert one.flops_executed > 0.99 * one.flops_needed > 0
+        json.dumps(dataclasses.asdict(one))
+
+
+def test_the_products_of_splash_attention_are_counted_with_their_padding():
+    shape = jax.ShapeDtypeStruct((2, 3, 500, 64), jnp.bfloat16)
+
+    def total(q, k, v):
+        return attention.attention(q, k, v).astype(jnp.float32).sum()
+
+    with target.use(Target("tpu")):
+        traced = jax.jit(jax.grad(total, (0, 1, 2))).trace(shape, shape, shape)
+    products = 2 + 3 + 4  # forward, queries, keys and values
+    expected = products * 2 * (2 * 3 * 512 * 512 * 128)
+    found = flops.executed(traced.jaxpr, "tpu").flops
+    assert found == {"attention": pytest.approx(expected, rel=1e-3)}
+
+
+REFUSALS = {
+    "RESOURCE_EXHAUSTED: E1000: CompileTimeHbmOom: Ran out of memory on HBM, the total memory "
+    "required for HLO temporaries (117.50G) exceeds available HBM (95.73G).": (117.50, 95.73),
+    "RESOURCE_EXHAUSTED: Ran out of memory in memory space hbm. Used 20.00G of 15.75G hbm. "
+    "Exceeded hbm capacity by 4.25G.": (20.0, 15.75),
+}
+
+
+@pytest.mark.parametrize("message", REFUSALS)
+def test_a_refusal_for_memory_is_an_answer_with_its_numbers(message):
+    needed, available = (number * 2**30 for number in REFUSALS[message])
+    assert target_compiler.parse_refusal(message) == (needed, available)
+    refused = target_compiler._refused(report(), message, 3.0, {})
+    assert not refused.fits
+    arguments = report().argument_bytes if "temporaries" in message else 0.0
+    assert (refused.peak_bytes, refused.capacity_bytes) == (needed + arguments, available)
+    with pytest.raises(UserError, match=r"failed on stage1: INTERNAL: something"):
+        target_compiler._refused(report(), "INTERNAL: something", 3.0, {})
+
+
+def report(**changes):
+    values = {
+        "name": "stage1",
+        "chip": "v5p",
+        "devices": 8,
+        "mesh": {"data": 1, "fsdp": 8, "tensor": 1, "context": 1},
+        "compiler": {"name": "libtpu", "version": "0.0.51"},
+        "options": {},
+        "argument_bytes": 4 * 2.0**30,
+        "temporary_bytes": 30 * 2.0**30,
+        "output_bytes": 4 * 2.0**30,
+        "alias_bytes": 4 * 2.0**30,
+        "peak_bytes": 34 * 2.0**30,
+        "capacity_bytes": 95 * 2.0**30,
+        "fits": True,
+        "refusal": "",
+        "flops_needed": 3e15,
+        "flops_executed": 4e15,
+        "bytes": 1e12,
+        "kernels": {"attention": {"splash_mha_fwd": 30}},
+        "collectives": [{"kind": "all-gather", "axis": "fsdp", "bytes": 1e10}],
+        "roofline_s": 8.7,
+        "bound": "flops",
+        "mfu": 0.75,
+        "trace_s": 10.0,
+        "compile_s": 200.0,
+        "notes": ["Nothing runs."],
+    }
+    return StageReport(**{**values, **changes})
+
+
+def test_the_plan_prints_every_stage_and_writes_the_numbers(monkeypatch, tmp_path):
+    asked = []
+
+    def compile_stage(config, stage, chip, devices):
+        asked.append((stage, chip.name, devices))
+        return report(name=stage)
+
+    monkeypatch.setattr(topology, "require_compiler", lambda chip: None)
+    monkeypatch.setattr(target_compiler, "compile_stage", compile_stage)
+    file, said = tmp_path / "plan.json", []
+    launch = Launch(plan=True, devices=2, chip="v5p", compiler="target", json=str(file))
+    target_plan.show(presets.load("tiny"), launch, said.append)
+    assert asked == [("stage1", "v5p", 2), ("stage2", "v5p", 2)]
+    text = "\n".join(said)
+    for words in ("34.00 GiB", "fits: 34.00 GiB of 95.00 GiB", "splash_mha_fwd × 30", "MFU 75.0%"):
+        assert words in text
+    stages = json.loads(file.read_text())["stages"]
+    assert [StageReport(**stage) for stage in stages] == [
+        report(name="stage1"),
+        report(name="stage2"),
+    ]
+
+
+def test_what_does_not_fit_is_printed_with_the_compiler_s_reason():
+    refused = report(
+        fits=False, peak_bytes=None, temporary_bytes=None, roofline_s=None, mfu=None, refusal="No."
+    )
+    text = "\n".join(target_plan.lines(refused, "stage 1", 256))
+    assert "does not fit: more of 95.00 GiB" in text
+    assert "the compiler refused it: No." in text
+
+
+PROGRAM = (Path(__file__).parent / "program.hlo").read_text()
+
+
+def test_a_chip_s_program_is_read_with_its_loops_slices_and_memories():
+    program = chip_program.read(PROGRAM)
+    assert program.kernels == {
+        "attention": {"splash_mha_fwd": 1},
+        "gemm": {"XLA fusion": 5},
+    }
+    assert program.unknown == ()
+    row = 8 * 4 * 4
+    in_loop = (8 * 16 * 4 + row) + (row + 4 + row) + (row + 4 + row)
+    kernel = 4 * 2 * 128 * 128 * 2
+    gather = 2 * 128 * 128 * 2  # its result is in on-chip memory
+    assert program.bytes == 5 * in_loop + kernel + gather
+    assert [item.kind for item in program.collectives] == ["all-gather"], "continuations are none"
+
+
+def test_communication_is_named_by_the_axes_of_the_mesh():
+    sizes = {"data": 2, "fsdp": 2, "tensor": 1, "context": 2}
+    items = [
+        hlo.Collective("all-gather", "", (0, 2), 1.0),
+        hlo.Collective("all-gather", "", (2, 0), 2.0),
+        hlo.Collective("all-reduce", "", (0, 2, 4, 6), 4.0),
+        hlo.Collective("all-reduce", "", tuple(range(8)), 8.0),
+        hlo.Collective("all-reduce", "", (0, 1, 2), 16.0),
+    ]
+    assert target_compiler._along_axes(items, sizes) == [
+        {"kind": "all-gather", "axis": "fsdp", "bytes": 3.0},
+        {"kind": "all-reduce", "axis": "data+fsdp", "bytes": 4.0},
+        {"kind": "all-reduce", "axis": "data+fsdp+context", "bytes": 8.0},
+        {"kind": "all-reduce", "axis": "other", "bytes": 16.0},
+    ]
+
+
+INDEPENDENT = """
+import functools, sys
+import jax, numpy as np
+from jax.experimental import topologies
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
+from pewm_jax import config, presets
+from pewm_jax.data import abstract
+from pewm_jax.nn import target
+from pewm_jax.train import stages, step
+from pewm_jax.worlds.pewm.world import STAGES
+import dataclasses
+
+settings = presets.load("tiny")
+settings = dataclasses.replace(
+    settings.with_model(dtype="bfloat16"),
+    train=dataclasses.replace(
+        settings.train,
+        stage1=dataclasses.replace(settings.train.stage1, batch=4),
+        stage2=dataclasses.replace(settings.train.stage2, steps=0),
+    ),
+)
+devices = topologies.get_topology_desc(platform="tpu", topology_name="v5e:2x2").devices
+mesh = Mesh(
+    np.array(devices).reshape(4, 1, 1, 1), config.AXES, axis_types=(AxisType.Auto,) * 4
+)
+everywhere, split = NamedSharding(mesh, P()), NamedSharding(mesh, P(("data", "fsdp")))
+stage, key = STAGES[0], jax.random.key(0)
+state = jax.eval_shape(functools.partial(step.create, settings, stage), key)
+clip = abstract.clip(settings, 4)
+place = lambda tree, where: jax.tree.map(
+    lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), tree
+)
+with jax.set_mesh(mesh), target.use(target.Target("tpu")):
+    function = jax.jit(
+        functools.partial(step.train_step, settings, stage),
+        out_shardings=(jax.tree.map(lambda _: everywhere, state), everywhere),
+        donate_argnums=0,
+    )
+    lowered = function.lower(place(state, everywhere), place(clip, split), place(key, everywhere))
+found = lowered.compile().memory_analysis()
+new = found.output_size_in_bytes - found.alias_size_in_bytes
+print(found.argument_size_in_bytes + found.temp_size_in_bytes + new)
+"""
+
+
+@pytest.mark.slow
+def test_the_peak_is_that_of_a_script_that_calls_the_compiler_itself(tmp_path):
+    try:
+        topology.require_compiler(chips.named("v5e"))
+    except UserError as error:
+        pytest.skip(str(error))
+    config = presets.load("tiny").with_model(dtype="bfloat16")
+    stages = {
+        "stage1": dataclasses.replace(config.train.stage1, batch=4),
+        "stage2": dataclasses.replace(config.train.stage2, steps=0),
+    }
+    config = dataclasses.replace(config, train=dataclasses.replace(config.train, **stages))
+    stage = target_compiler.compile_stage(config, "stage1", chips.named("v5e"), 4)
+    done = subprocess.run(
+        [sys.executable, "-c", INDEPENDENT],
+        env={**os.environ, **topology.ENVIRONMENT, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert stage.peak_bytes == pytest.approx(float(done.stdout.split()[-1]), rel=0.01)
+
+
+@pytest.mark.parametrize("chip", ["v5e", "h100"])
+def test_a_tiny_step_is_compiled_for_a_chip_that_is_not_there(tmp_path, chip):
+    try:
+        topology.require_compiler(chips.named(chip))
+    except UserError as error:
+        pytest.skip(str(error))
+    file = tmp_path / "plan.json"
+    flags = ("--chip", chip, "--devices", "4", "--compiler", "target", "--json", str(file))
+    done = subprocess.run(
+        [sys.executable, "-m", "pewm_jax", "plan", "tiny", *flags, *SMALL],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (stage,) = (StageReport(**one) for one in json.loads(file.read_text())["stages"])
+    assert stage.fits
+    assert 0 < stage.peak_bytes < stage.capacity_bytes
+    new = stage.output_bytes - stage.alias_bytes
+    assert stage.peak_bytes == stage.argument_bytes + stage.temporary_bytes + new
+    assert stage.flops_executed > 0.99 * stage.flops_needed > 0
+    assert stage.kernels["gemm"]
+    assert ("attention" in stage.kernels) == (chip == "h100"), "few tokens need none on a TPU"
+    assert {item["axis"] for item in stage.collectives} == {"data"}
+    assert "fits: " in done.stdout
+    assert dataclasses.asdict(stage)["compiler"]["version"]
