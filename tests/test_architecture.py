@@ -79,6 +79,7 @@ FORMER_COMMANDS = {f"{name}/__main__" for name in ("convert", "data", "memory")}
 BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}
 """Functions whose first argument is the name of a module that they import or look for."""
 ANY_NAME = {
+    "cli/plugins",
     "__init__",
     "_moved",
     "cli/main",

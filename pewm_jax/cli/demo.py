@@ -7,10 +7,9 @@ import importlib.metadata
 import shlex
 from pathlib import Path
 
-from pewm_jax import presets
+from pewm_jax import presets, registry
 from pewm_jax.cli import main, parser
 from pewm_jax.errors import ConfigError
-from pewm_jax.worlds.pewm.world import PEWM
 
 SIZE = 64
 """Default width and height of the images of `data collect`, pixels."""
@@ -51,7 +50,7 @@ class Settings:
             ConfigError: they are not square, or the preset is not of a world with a map.
         """
         model = presets.load(self.preset).model
-        maps = type(model) is PEWM  # other worlds need other data
+        maps = registry.of(model).name == "pewm"  # other worlds need other data
         if not maps or model.clip.width != model.clip.height:
             raise ConfigError(
                 f"--preset {self.preset} does not fit the demo, which trains a world with a map on "

@@ -133,6 +133,6 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, tmp_path):
         with pytest.raises(UserError, match=sentence):
             inference.export(source, target, log=lambda _: None)
     (run / runs.WEIGHTS).write_bytes((run / "away").read_bytes()[:-5])
-    with pytest.raises(UserError, match="cut short"):
+    with pytest.raises(UserError, match="truncated"):
         inference.export(run, tmp_path / "x", log=lambda _: None)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["runs", "there"]

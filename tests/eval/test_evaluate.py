@@ -495,7 +495,7 @@ def test_a_training_without_a_memory_that_is_not_finished_is_refused(run, tmp_pa
     short = rival(run, tmp_path / "short", steps=3)
     params = weights.load(short / "weights.safetensors")
     weights.save(short / "weights.safetensors", params, {"stage": "1", "step": "2"})
-    with pytest.raises(UserError, match="step 2 and 3 of stage1"):
+    with pytest.raises(UserError, match="from step 2 of 3 of stage1"):
         report.evaluate(short, log=lambda _: None)
 
 

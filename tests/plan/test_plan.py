@@ -79,8 +79,8 @@ def test_a_plan_need_not_be_compiled_and_is_not_where_that_takes_very_long(monke
 def test_the_u_net_of_svd_has_too_many_arrays_to_compile():
     config = configs.load("egowm_svd")
     (stage,) = stages.planned(config)
-    assert not plan._wanted(config, stage, launch())
-    assert plan._wanted(config, stage, dataclasses.replace(launch(), compiled="on"))
+    assert not plan._should_compile(config, stage, launch())
+    assert plan._should_compile(config, stage, dataclasses.replace(launch(), compiled="on"))
 
 
 def test_what_cannot_be_planned_is_refused_before_anything_is_compiled(monkeypatch):

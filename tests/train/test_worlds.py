@@ -1,9 +1,8 @@
-"""A world with stages of its own names and number is trained as PEWM is: nothing knows two."""
+"""A task with stages of its own names and number is trained as PEWM is: nothing knows two."""
 
 import dataclasses
 import json
 import shutil
-import types
 from typing import ClassVar
 
 import jax
@@ -15,7 +14,7 @@ from jax.sharding import PartitionSpec as P
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
-from pewm_jax.config import Config, ConfigError, StageConfig, TrainSettings, World, register
+from pewm_jax.config import Config, ConfigError, StageConfig, Task, TrainSettings, register
 from pewm_jax.data import loader
 from pewm_jax.io import tree
 from pewm_jax.train import loop, stages
@@ -34,12 +33,21 @@ class ThreeStages(TrainSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class LineConfig(World):
-    """A line through points: the world needs no clip, no codec and no memory."""
+class LineConfig(Task):
+    """A line through points: the task needs no clip, no codec and no memory."""
 
     TRAIN: ClassVar[type[TrainSettings]] = ThreeStages
 
     width: int = 3
+
+    def init(self, key):
+        return init(self, key)
+
+    def stages(self):
+        return line_stages(self)
+
+    def sharding(self):
+        return (("slope", P("fsdp")), ("offset", P()))
 
 
 def init(model, key):
@@ -68,16 +76,10 @@ def clips(config, split="train", *, seed, batch, start_step=0, **_options):
 
 @pytest.fixture
 def line(monkeypatch):
-    """Registers the world, for one test."""
-    functions = types.SimpleNamespace(
-        init=init,
-        stages=line_stages,
-        sharding=lambda model: (("slope", P("fsdp")), ("offset", P())),
-        split_heads=lambda model, stage: {},
-    )
+    """Register the task, for one test."""
     monkeypatch.setattr(kinds, "_KINDS", dict(kinds._KINDS))
     monkeypatch.setattr(loader, "clips", clips)
-    register("world", "line", LineConfig, functions)
+    register("world", "line", LineConfig)
 
 
 def config(run, **changes):
