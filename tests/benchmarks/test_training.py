@@ -34,6 +34,7 @@ def parts(benchmark):
     return benchmark.training_parts
 
 
+@pytest.mark.slow
 def test_the_clocks_see_every_step_save_and_line_of_the_real_loop(parts, fake_model, tmp_path):
     config = fakes.config(tmp_path / "run", stage1=12, stage2=12, save_every=4)
     with parts.clocks() as spans:

@@ -31,6 +31,7 @@ def videos(*shape, seed=0):
     return np.random.default_rng(seed).uniform(-1, 1, (*shape, 3)).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1, 8, 8), (1, 9, 16, 24), (3, 2, 24, 8)])
 def test_latents_are_an_eighth_of_the_frame_each_way_and_come_back(params, shape):
     batch, frames, height, width = shape
@@ -106,6 +107,7 @@ def model():
     )
 
 
+@pytest.mark.slow
 def test_colour_and_depth_go_through_the_same_weights(params):
     world, rng = model(), np.random.default_rng(0)
     rgb = videos(2, 3, 16, 32)

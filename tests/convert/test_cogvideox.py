@@ -243,6 +243,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     jax.tree.map(np.testing.assert_array_equal, narrow, params)
 
 
+@pytest.mark.slow
 def test_the_video_model_in_a_training_run_is_exported(widened, tmp_path):
     """All that a run changed goes back, the new channels and the memory blocks apart."""
     config, params = pewm_jax.load(widened)

@@ -62,6 +62,7 @@ def test_where_nothing_is_met_there_is_no_depth():
     assert (seen.ids_THW == -1).all()
 
 
+@pytest.mark.slow
 def test_an_episode_of_cells_shows_the_cells_it_records():
     voxels = VoxelsConfig(record=True, cell=0.25, side=24, kinds="groups", pictures="cells")
     plain = CollectConfig(Path("x"), frames=3, size=32)

@@ -116,7 +116,7 @@ def conditioning_of(model, params, clip):
     return world_model.condition(model, params, observed, Control(frames.camera))
 
 
-@pytest.mark.slow(but="v")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["x0", "v"])
 def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
     model, train = tiny_model(noise=DDPMConfig(target=kind)), TrainConfig()

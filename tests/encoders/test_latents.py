@@ -213,6 +213,7 @@ def test_a_fresh_reader_and_an_empty_memory_change_nothing_bit_for_bit(kind):
     assert np.abs(predict(kind, learned, first)[0] - base[0]).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_latents_of_cells_of_which_nothing_is_seen_are_not_read():
     _, encoded, _ = inputs()
     blind = ~encoded.seen_THW.reshape(2, 5, 2, 8, 3, 8).any((3, 5))

@@ -39,6 +39,7 @@ def scene(tmp_path_factory):
     return config, episodes, Methods(model, ReprojectSettings())
 
 
+@pytest.mark.slow
 def test_who_knows_the_way_comes_back_to_what_was_left(scene, tmp_path, monkeypatch):
     config, episodes, methods = scene
     partials, rollouts = (
@@ -115,6 +116,7 @@ class Colours(VideoDistance):
         return np.asarray(video_BTHWC).mean((2, 3)).reshape(len(video_BTHWC), -1)
 
 
+@pytest.mark.slow
 def test_videos_are_compared_as_wholes_and_their_features_kept(scene, tmp_path, monkeypatch):
     config, episodes, methods = scene
     i3d, partials = (
@@ -167,7 +169,7 @@ def test_measures_that_cost_are_left_out_in_a_sentence(monkeypatch):
     monkeypatch.setattr(i3d_weights, "installed", lambda: None)
     assert "no weights of I3D are installed" in selection.select_fvd("", 9, accelerator=True)[1]
     monkeypatch.setattr(i3d_weights, "installed", lambda: "there")
-    assert "I3D needs 9 frames and a clip has 5" in selection.select_fvd("", 5, accelerator=True)[1]
+    assert "I3D needs 9 frames, but a clip has 5" in selection.select_fvd("", 5, accelerator=True)[1]
     assert "--fvd on enables them" in selection.select_fvd("", 9, accelerator=False)[1]
     assert selection.select_fvd("off", 9, accelerator=True)[0] is None
     with pytest.raises(UserError, match=r"too short for I3D.*--chain"):

@@ -176,7 +176,7 @@ def test_padding_of_a_short_context_is_not_remembered(episodes, tmp_path, kind):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
-@pytest.mark.slow(only="up to")
+@pytest.mark.slow(but="points of 1 pixel each, the mean of those at the front")
 @pytest.mark.parametrize("settings", CANDIDATES, ids=str)
 def test_padding_of_a_short_context_is_not_reprojected_twice(episodes, tmp_path, settings):
     config = tiny(tmp_path)

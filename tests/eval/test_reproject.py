@@ -76,6 +76,7 @@ def test_a_wall_seen_from_behind_is_not_shown_and_hides_what_is_behind_it():
         assert 0.2 < hidden.sum() / green(settings, alone).sum() < 0.8  # by its half
 
 
+@pytest.mark.slow
 def test_frames_without_depth_do_not_count(seen):
     blank = some(seen, [0, 1])
     blank = Frames(blank.rgb_THWC * 0, blank.depth_THW * 0, blank.camera)

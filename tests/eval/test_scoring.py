@@ -79,6 +79,7 @@ def test_a_model_that_is_one_frame_late_is_noticed(knowing_model, episodes, tmp_
     assert table(scored.sums, scored.clusters)["memory"]["all"]["psnr"]["mean"] < 25
 
 
+@pytest.mark.slow
 def test_batches_do_not_change_the_numbers(knowing_model, episodes, tmp_path):
     sums = []
     for batch in (2, 3):
@@ -208,6 +209,7 @@ def test_pieces_of_another_protocol_stay_and_stay_apart(tmp_path):
     assert again.get("piece")["x"].tolist() == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_long_rollouts_keep_pictures_and_the_map(monkeypatch, knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, video_clips=9)
     model = knowing_model()

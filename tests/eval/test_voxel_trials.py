@@ -93,6 +93,7 @@ def test_enough_trials_are_enough(standing):
     assert found.facts()["without_room"] == 1
 
 
+@pytest.mark.slow
 def test_what_a_camera_sees_of_a_block_and_whether_it_is_in_the_window(standing):
     model = world(0.5)
     camera = jax.tree.map(lambda x: x[0][None], cameras(1))

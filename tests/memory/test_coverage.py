@@ -15,7 +15,7 @@ from tests.helpers import random_camera
 from tests.memory.test_memories import ALL, KINDS, encoded, model_of, scene, seen
 
 
-@pytest.mark.slow(but="voxel")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_looked_at_is_chosen_and_what_is_chosen_is_held(kind):
     model = model_of(kind)

@@ -6,10 +6,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 
 
+@pytest.mark.slow
 def test_a_batch_of_maps_is_built_where_its_frames_are():
     done = subprocess.run(
         [sys.executable, str(HERE / "devices.py")],

@@ -203,6 +203,7 @@ def test_snapshots_stand_where_their_patches_show_and_repetition_adds_none():
     assert int(kept.valid_KP.any(1).sum()) <= 2
 
 
+@pytest.mark.slow
 def test_snapshots_chosen_over_time_stay_the_best_of_what_was_kept():
     model, frames = model_of("images", snapshots=2), scene(count=4)
     memory = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
@@ -278,6 +279,7 @@ def test_points_that_do_not_fit_are_counted_and_the_earlier_ones_stay():
     np.testing.assert_array_equal(cloud.sums_V7[:, 0], [1, 2, 2])
 
 
+@pytest.mark.slow
 def test_the_map_from_above_is_the_maximum_over_the_height():
     model = model_of("map2d", cell_m=(0.5, 0.5, 0.5), cells=(24, 24, 8))
     frames = scene()

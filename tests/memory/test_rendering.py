@@ -92,6 +92,7 @@ def test_the_nearest_is_in_front_and_of_equals_the_first():
         np.testing.assert_allclose(view.depth_THW[view.seen_THW], 2, rtol=1e-6)
 
 
+@pytest.mark.slow(but=("voxel", "surfels"))
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_memory_can_be_rendered(kind):
     model = model_of(kind)
@@ -243,6 +244,7 @@ def wall(distance, spacing, across=2.5):
     return np.stack([np.full(y.size, distance), y.ravel(), z.ravel()], -1).astype(np.float32)
 
 
+@pytest.mark.slow(but="False")
 @pytest.mark.parametrize("average", [True, False])
 def test_a_wall_is_not_seen_through_the_wall_before_it(average):
     """Both of a raster of 10 cm; the near one is seen so closely that its points lie apart."""
@@ -270,6 +272,7 @@ def test_a_wall_is_not_seen_through_the_wall_before_it(average):
     np.testing.assert_allclose(image[:, : size // 2 - 2], -1, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_points_with_a_size_are_drawn_alike_in_a_batch_and_again():
     camera = jax.tree.map(jnp.asarray, random_camera(np.random.default_rng(5), 2, HEIGHT, WIDTH))
     points, features, valid = (jnp.stack([jnp.asarray(x)] * 2) for x in cloud(5))

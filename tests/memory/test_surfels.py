@@ -216,7 +216,7 @@ def test_wrong_settings_are_refused_in_a_sentence():
         model.memory.insert(model, {}, memory, scene())
 
 
-@pytest.mark.slow(but="3")
+@pytest.mark.slow
 @pytest.mark.parametrize("footprint", [1, 3])
 def test_what_was_seen_is_seen_again_by_the_camera_that_saw_it(footprint):
     model = of(SMALL, cell_m=(0.02,) * 3, cells=(1024,) * 3, capacity=1024, footprint=footprint)

@@ -100,6 +100,7 @@ def test_few_corners_are_read_on_walls_and_all_of_them_on_noise():
     assert shares[1] > 0.8
 
 
+@pytest.mark.slow
 def test_large_pictures_of_walls_and_of_noise_in_one_batch():
     """Large enough for the short way; the members of the batch need different numbers of blocks."""
     pair = [a_clip(seed, kind, (2, 256, 256)) for seed, kind in ((3, "room"), (4, "noise"))]
@@ -119,6 +120,7 @@ def test_a_bfloat16_map_is_the_rounded_float32_map():
     np.testing.assert_array_equal(half.features_VF, full.features_VF.astype(jnp.bfloat16))
 
 
+@pytest.mark.slow
 def test_upsampled_features_never_exist_and_the_extent_costs_nothing():
     frames, _ = a_clip(6, "room", (4, 128, 128))
     patches = np.zeros((4, 8, 8, 64), np.float32)

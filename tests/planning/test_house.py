@@ -200,6 +200,7 @@ def test_walls_hold_in_a_house_too():
     assert collisions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["sync", "async"])
 def test_several_houses_step_at_once(mode):
     options = {"vector_kwargs": {"context": "spawn"}} if mode == "async" else {}

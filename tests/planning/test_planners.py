@@ -36,6 +36,7 @@ def successes(planner, seen=True):
     return np.asarray(jax.jit(jax.vmap(one))(starts, goals, distances, keys))
 
 
+@pytest.mark.slow
 def test_cem_reaches_the_goals_within_its_horizon():
     assert successes(CEM()).mean() >= 0.95
 

@@ -395,6 +395,7 @@ def test_with_the_true_renderer_goals_within_the_horizon_are_reached(cost):
     assert np.mean(by_chance) < 0.5
 
 
+@pytest.mark.slow
 def test_an_agent_that_knows_the_truth_walks_to_its_goal():
     rng = np.random.default_rng(1)
     start = pose_from_yaw((*sample_free(home()[1], rng, 1)[0], HEIGHT), 0.3)

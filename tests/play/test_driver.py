@@ -251,6 +251,7 @@ def test_drags_and_switches_are_coalesced_while_a_step_is_imagined(drives):
     assert not told.session.walls
 
 
+@pytest.mark.slow
 def test_one_drag_drives_a_bounded_number_of_steps_and_says_so(drives):
     one, told = drives()
     before = told.session

@@ -77,6 +77,7 @@ def test_a_step_is_what_the_world_imagines_and_what_was_imagined_ahead_is_the_sa
     same(now.blind.map, a_session().world.map)  # without memory nothing is added to it
 
 
+@pytest.mark.slow
 def test_the_code_of_the_documentation_runs(monkeypatch, capsys):
     (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     tiny = an_engine()

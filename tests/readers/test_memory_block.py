@@ -202,6 +202,7 @@ def test_masked_tokens_have_no_gradient_and_an_empty_map_a_finite_one(positions)
         np.testing.assert_array_equal(leaf, 0)
 
 
+@pytest.mark.slow
 @BOTH
 def test_without_a_memory_the_block_still_learns_its_feed_forward(positions):
     valid = inputs()[1].valid_M

@@ -74,7 +74,7 @@ def hidden(readout):
     return MemoryReadout(tokens, dataclasses.replace(view, seen_THW=jnp.zeros_like(view.seen_THW)))
 
 
-@pytest.mark.slow(but="render")
+@pytest.mark.slow(but="attend")
 @ALL
 def test_a_fresh_reader_changes_nothing_bit_for_bit(kind):
     model, (_, readout, _) = model_of(kind), inputs()
@@ -85,6 +85,7 @@ def test_a_fresh_reader_changes_nothing_bit_for_bit(kind):
     np.testing.assert_array_equal(predict(model, params, readout), base)
 
 
+@pytest.mark.slow
 @ALL
 def test_an_empty_memory_changes_nothing_bit_for_bit_whatever_was_learned(kind):
     model, (_, readout, _) = model_of(kind), inputs()
@@ -170,7 +171,7 @@ def batch_of(model, count=2):
     return Clip(frames, frames, jnp.ones((count, 9), bool))
 
 
-@pytest.mark.slow(but="VoxelConfig")
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [VoxelConfig, SurfelConfig])
 def test_a_rollout_looks_as_training_does(memory):
     model = model_of("both", memory)

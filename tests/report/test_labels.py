@@ -11,5 +11,5 @@ def growth(capacity):
 def test_the_room_of_a_map_is_said_where_it_is_known():
     (known,) = labels.format_map_growth(growth(256))
     (unknown,) = labels.format_map_growth(growth(None))
-    assert known.endswith("in 8 imagined frames, of 256 that it has room for.")
+    assert known.endswith("in 8 imagined frames, with a capacity of 256.")
     assert unknown.endswith("from 10 to 20 points in 8 imagined frames.")

@@ -247,6 +247,7 @@ def test_rows_have_about_the_same_parameters_and_the_same_extent():
     assert set(table1_numbers.CHAIN) <= {row.name for row in every}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", table1_rows.ABLATIONS)
 def test_an_ablation_varies_what_it_says_and_nothing_else(name):
     base = presets.load("table1")

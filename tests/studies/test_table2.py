@@ -219,7 +219,7 @@ class _Spied(deciders.Predictors):
         return super().observe(mind, state, frames)
 
 
-@pytest.mark.slow(but="truth")
+@pytest.mark.slow
 @pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
 def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
     config = presets.load("tiny")  # 4 actions at once

@@ -180,6 +180,7 @@ def of_32(batch):
     )
 
 
+@pytest.mark.slow
 def test_lpips_counts_as_much_as_it_weighs(tmp_path):
     config = perceptual(tmp_path)
     stage, make = worlds.stages(config)[0], of_32(batch)

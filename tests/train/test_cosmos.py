@@ -96,6 +96,7 @@ def test_every_leaf_has_its_place_on_many_devices():
         assert split or small or "codec" in path, f"{path} {leaf.shape} is whole"
 
 
+@pytest.mark.slow
 def test_frames_that_are_given_do_not_count_in_the_loss(monkeypatch):
     def latents(model, _params, rgb, _depth, **_):
         grid = (model.codec.frames(rgb.shape[1]), *model.latent_shape[1:], model.codec.channels)

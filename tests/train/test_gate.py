@@ -96,6 +96,7 @@ def test_only_the_gate_learns_in_its_stage_and_the_run_can_be_loaded(clips, tmp_
     assert np.abs(after["codec/gate/out/kernel"]).max() > 0
 
 
+@pytest.mark.slow
 def test_with_what_was_seen_the_gate_makes_more_of_noisy_latents_than_the_decoder():
     config = experiment()
     stage = worlds.stages(config)[2]
@@ -164,6 +165,7 @@ def test_the_gate_learns_alone_on_what_the_model_imagines(reader):
     assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_lpips_of_the_mixed_frames_counts_as_much_as_it_weighs(monkeypatch):
     rng = np.random.default_rng(0)
     model, shape = imagining().model, (1, 2, 32, 32)

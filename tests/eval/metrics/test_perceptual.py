@@ -93,6 +93,7 @@ def test_depth_is_compared_where_both_have_one(name):
         metric(truth.astype(np.int32), truth.astype(np.int32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex"])
 def test_a_clips_number_does_not_depend_on_the_batch(name, files):
     metric = metrics.load(name, files.get(name))
@@ -124,6 +125,7 @@ def test_few_pictures_at_once_give_the_same_distances(files, monkeypatch):
     perceptual._distances.clear_cache()
 
 
+@pytest.mark.slow(but="0")
 @pytest.mark.parametrize("kept", [2**28, 0])
 def test_a_truth_that_passed_the_network_before_gives_the_same_distances(files, monkeypatch, kept):
     """And where its features would take too much room, they are made again."""

@@ -147,6 +147,7 @@ def test_equal_end_to_end(name):
             assert distance(got, want) < 2e-5, (shape, times)
 
 
+@pytest.mark.slow
 def test_in_bfloat16_no_further_from_float32_than_the_reference():
     name = "5b"
     config, network = shrunken(name), reference(name)

@@ -81,6 +81,7 @@ def compare(reference, ours, video):
     )
 
 
+@pytest.mark.slow(but="9-24-8")
 @pytest.mark.parametrize(
     ("frames", "height", "width"),
     [
@@ -101,6 +102,7 @@ def test_the_minimal_filtering_is_the_same(reference, ours):
     assert max(compare(reference, ours, draw(1, 3, 9, 24, 8))) < TOLERANCE
 
 
+@pytest.mark.slow
 def test_inside_jit_the_chunks_are_scanned(reference, ours):
     config, params = ours
     latents = draw(2, 4, 5, 3, 1)
@@ -109,6 +111,7 @@ def test_inside_jit_the_chunks_are_scanned(reference, ours):
     assert distance(video, last(reference.decode(latents).sample)) < TOLERANCE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 def test_an_even_number_of_latents_has_no_first_frame_rule(reference, ours, count, caplog):
     config, params = ours

@@ -97,7 +97,7 @@ def test_drop_is_the_network_with_rotary_positions_alone(params, shape):
     np.testing.assert_array_equal(run(choose("drop"), params, shape), want)
 
 
-@pytest.mark.slow(but="shape0")
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [OTHER_FRAMES, OTHER_SIZE, (1, 2, 2)])
 def test_a_resized_table_is_used_and_learns(params, shape):
     def loss(params):

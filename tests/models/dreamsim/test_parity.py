@@ -137,6 +137,7 @@ def test_the_features_and_distances_equal_the_reference(made):
     np.testing.assert_allclose(dreamsim.distance(params, a, b), expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_clips_are_measured_frame_by_frame_at_any_size(made):
     metric = metrics.load("dreamsim", made[0])
     rng = np.random.default_rng(1)

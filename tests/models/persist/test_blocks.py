@@ -96,6 +96,7 @@ def net(request):
     return module, config, run, params, inputs, run(params, inputs)[0]
 
 
+@pytest.mark.slow(but="renderer")
 def test_frame_by_frame_with_a_cache_is_all_at_once(net):
     module, config, run, params, inputs, whole = net
     cache = module.empty_cache(config, 2)

@@ -133,6 +133,7 @@ def test_it_equals_torch_and_its_other_form(net):
             np.testing.assert_allclose(a / scale, b / scale, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_slabs_change_nothing_and_drawn_cells_are_a_sample():
     config, key = FOLDED, jax.random.key(1)
     params, ids = weights(voxel_vae, config), grids(config)
@@ -222,6 +223,7 @@ def test_with_kernels_of_one_place_a_latent_tells_of_its_own_patch_alone():
     np.testing.assert_array_equal(cells // [1, 4, 4, 4], np.tile(places, (len(cells), 1)))
 
 
+@pytest.mark.slow
 def test_residual_blocks_change_nothing_at_first_and_it_learns():
     import optax
 

@@ -119,6 +119,7 @@ def test_guidance_hides_the_image_and_leaves_the_actions(params):
     assert np.any(blind.modulation_BtE)
 
 
+@pytest.mark.slow
 def test_the_last_frames_are_kept_as_history(params):
     frames = seen()
     state = worlds.start(LATER, params, frames)

@@ -82,6 +82,7 @@ def test_one_image_begins_a_world_whose_window_is_known(state):
     np.testing.assert_allclose(floor, np.round(floor), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_imagined_twice_is_the_same_and_its_caches_have_grown(params, state, walked):
     equal(imagine(MODEL, params, state, MOVES, KEY), walked)
     after, frames = walked

@@ -109,6 +109,7 @@ def test_every_memory_remembers_only_what_was_asked_for(kind):
         np.testing.assert_allclose(a, b, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_cameras_steer_as_the_actions_that_lead_to_them(params, state, two_clips):
     after, frames = two_clips
     by_camera, seen_by = imagine(MODEL, params, state, frames.camera, KEY)
