@@ -367,7 +367,7 @@ def _along_axes(collectives: Any, sizes: dict[str, int]) -> list[dict[str, Any]]
     groups = _groups(sizes)
     sent: dict[tuple[str, str], float] = {}
     for item in collectives:
-        axis = groups.get(tuple(sorted(item.group)), "other")
+        axis = _axis(item.group, groups)
         key = item.kind, axis
         sent[key] = sent.get(key, 0.0) + item.sent
     return [
@@ -375,6 +375,15 @@ def _along_axes(collectives: Any, sizes: dict[str, int]) -> list[dict[str, Any]]
         for (kind, axis), size in sorted(sent.items())
         if size
     ]
+
+
+def _axis(group: tuple[int, ...], groups: dict[tuple[int, ...], str]) -> str:
+    """Return the axes along which devices communicate: all along them, or some of these."""
+    around = [axes for whole, axes in groups.items() if set(group) <= set(whole)]
+    exact = groups.get(tuple(sorted(group)))
+    if exact or len(group) != 2 or not around:  # a permutation names pairs
+        return exact or "other"
+    return min(around, key=lambda axes: axes.count("+"))
 
 
 def _groups(sizes: dict[str, int]) -> dict[tuple[int, ...], str]:
