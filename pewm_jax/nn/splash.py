@@ -8,6 +8,8 @@ backward pass recomputes the attention weights from it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -51,7 +53,8 @@ def splash(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, *, interpret: bool = Fal
     """
     from jax.experimental.pallas.ops.tpu import splash_attention as pallas  # noqa: PLC0415 - slow
 
-    _, heads, queries, channels = q_BKND.shape
+    shape: tuple[int, ...] = q_BKND.shape
+    _, heads, queries, channels = shape
     keys: int = k_BKMD.shape[2]
     rows, columns = tile(queries), tile(keys)
     q = _padded(q_BKND * channels**-0.5, rows)
@@ -77,7 +80,7 @@ def splash(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, *, interpret: bool = Fal
         segments = pallas.SegmentIds(
             q=jnp.zeros(q.shape[2], jnp.int32), kv=padding.astype(jnp.int32)
         )
-    out = jax.vmap(kernel, in_axes=(0, 0, 0, None))(q, k, v, segments)
+    out: Any = jax.vmap(kernel, in_axes=(0, 0, 0, None))(q, k, v, segments)
     return out[:, :, :queries, :channels]
 
 

@@ -106,7 +106,7 @@ class _Walk:
 
     def _computation(self, name: str) -> _Cost:
         cost, lines = _Cost(), self.computations.get(name, {})
-        for line in lines.values():
+        for own, line in lines.items():
             opcode = line.opcode
             if opcode == "while":
                 body, trips = _BODY.search(line.rest), self._trips(line)
@@ -123,7 +123,7 @@ class _Walk:
             elif opcode not in NO_TRAFFIC and not opcode.endswith(("-done", "-update")):
                 cost.bytes += self._traffic(line, lines)
                 cost.collectives += self._collectives(line, lines)
-                kernel = self._kernel(line)
+                kernel = self._kernel(own, line)
                 if kernel:
                     cost.kernels[kernel] += 1
         return cost
@@ -169,10 +169,15 @@ class _Walk:
             )
             yield from hlo.collectives_of(inner, around, lambda _, sliced=scattered: sliced)
 
-    def _kernel(self, line: Line) -> tuple[str, str] | None:
-        """Return the kind and name of the kernel that an instruction launches."""
+    def _kernel(self, own: str, line: Line) -> tuple[str, str] | None:
+        """Return the kind and name of the kernel that an instruction launches.
+
+        Args:
+            own: the name of the instruction.
+            line: the instruction.
+        """
         if line.opcode == "custom-call":
-            return _library_kernel(line)
+            return _library_kernel(own, line)
         if line.opcode in ("dot", "convolution"):
             return _kind(line), f"XLA {line.opcode}"
         if line.opcode != "fusion":
@@ -182,7 +187,7 @@ class _Walk:
             inner = next(
                 (one for _, one in self._inside(line) if one.opcode == "custom-call"), None
             )
-            return _library_kernel(inner) if inner else None
+            return _library_kernel(own, inner) if inner else None
         found = _FUSION.search(line.rest)
         return _kind(products[0]), found[1] if found else "XLA fusion"
 
@@ -279,11 +284,14 @@ def _kind(product: Line) -> str:
     return CONVOLUTION
 
 
-def _library_kernel(line: Line) -> tuple[str, str] | None:
-    """Return the kind and name of a kernel that a library or Pallas provides."""
+def _library_kernel(own: str, line: Line) -> tuple[str, str] | None:
+    """Return the kind and name of a kernel that a library or Pallas provides.
+
+    Pallas names the instruction after the kernel.
+    """
     found = _TARGET.search(line.rest)
     name = found[1] if found else ""
-    if splash := _SPLASH.search(line.rest):
+    if splash := _SPLASH.search(own):
         return ATTENTION, splash[0]
     for part, kind in (("fmha", ATTENTION), ("conv", CONVOLUTION), ("cublas", GEMM)):
         if part in name.lower():

@@ -238,16 +238,23 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
     )
     options: dict[str, str | bool] = {}
     began = time.monotonic()
-    try:
+    with tempfile.TemporaryDirectory(prefix="pewm-hlo-") as folder:
+        # A TPU's compiled program cannot always be printed; what its compiler writes can be read.
+        written: dict[str, str | bool] = (
+            {"xla_dump_to": folder, "xla_dump_hlo_as_text": True} if chip.platform == "tpu" else {}
+        )
         try:
-            compiled = lowered.compile()
+            try:
+                compiled = lowered.compile(compiler_options=written)
+            except jax.errors.JaxRuntimeError as error:
+                if NO_TILES not in str(error):
+                    raise
+                options = NO_TRITON
+                compiled = lowered.compile(compiler_options={**written, **options})
         except jax.errors.JaxRuntimeError as error:
-            if NO_TILES not in str(error):
-                raise
-            options = NO_TRITON
-            compiled = lowered.compile(compiler_options=options)
-    except jax.errors.JaxRuntimeError as error:
-        return _refused(report, str(error), time.monotonic() - began, options)
+            return _refused(report, str(error), time.monotonic() - began, options)
+        compile_s = time.monotonic() - began
+        text = _text(compiled, Path(folder))
     memory: Any = compiled.memory_analysis()
     arguments, temporary = measure.device_memory(compiled)
     notes: list[str] = list(UNKNOWN)
@@ -260,13 +267,12 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
         alias_bytes=float(memory.alias_size_in_bytes),
         peak_bytes=arguments + temporary,
         fits=arguments + temporary <= capacity,
-        compile_s=time.monotonic() - began,
+        compile_s=compile_s,
     )
-    try:
-        program = chip_program.read(compiled.as_text() or "")
-    except jax.errors.JaxRuntimeError:
+    if not text:
         notes.append("The compiler does not print this program: its kernels are unknown.")
         return dataclasses.replace(_timed(report, config, chip, 0.0), notes=notes)
+    program = chip_program.read(text)
     if program.unknown:
         notes.append(f"Loops of unknown length count as one run: {', '.join(program.unknown)}.")
     if options:
@@ -279,6 +285,19 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
         notes=notes,
     )
     return _timed(report, config, chip, _link_seconds(program.collectives, chip))
+
+
+def _text(compiled: Any, folder: Path) -> str:
+    """Return the text of a compiled program, or nothing if it is not available."""
+    from jax.errors import JaxRuntimeError  # noqa: PLC0415 - only this process uses JAX
+
+    try:
+        return compiled.as_text() or ""
+    except JaxRuntimeError:
+        for name in ("after_codegen", "after_optimizations"):
+            for file in folder.glob(f"*train_step*.{name}.txt"):
+                return file.read_text()
+    return ""
 
 
 def _refused(
@@ -348,7 +367,7 @@ def _along_axes(collectives: Any, sizes: dict[str, int]) -> list[dict[str, Any]]
     groups = _groups(sizes)
     sent: dict[tuple[str, str], float] = {}
     for item in collectives:
-        axis = groups.get(tuple(sorted(item.group)), "other")
+        axis = _axis(item.group, groups)
         key = item.kind, axis
         sent[key] = sent.get(key, 0.0) + item.sent
     return [
@@ -356,6 +375,15 @@ def _along_axes(collectives: Any, sizes: dict[str, int]) -> list[dict[str, Any]]
         for (kind, axis), size in sorted(sent.items())
         if size
     ]
+
+
+def _axis(group: tuple[int, ...], groups: dict[tuple[int, ...], str]) -> str:
+    """Return the axes along which devices communicate: all along them, or some of these."""
+    around = [axes for whole, axes in groups.items() if set(group) <= set(whole)]
+    exact = groups.get(tuple(sorted(group)))
+    if exact or len(group) != 2 or not around:  # a permutation names pairs
+        return exact or "other"
+    return min(around, key=lambda axes: axes.count("+"))
 
 
 def _groups(sizes: dict[str, int]) -> dict[tuple[int, ...], str]:

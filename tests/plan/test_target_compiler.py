@@ -208,12 +208,14 @@ def test_communication_is_named_by_the_axes_of_the_mesh():
         hlo.Collective("all-reduce", "", (0, 2, 4, 6), 4.0),
         hlo.Collective("all-reduce", "", tuple(range(8)), 8.0),
         hlo.Collective("all-reduce", "", (0, 1, 2), 16.0),
+        hlo.Collective("collective-permute", "", (3, 2), 32.0),
     ]
     assert target_compiler._along_axes(items, sizes) == [
         {"kind": "all-gather", "axis": "fsdp", "bytes": 3.0},
         {"kind": "all-reduce", "axis": "data+fsdp", "bytes": 4.0},
         {"kind": "all-reduce", "axis": "data+fsdp+context", "bytes": 8.0},
         {"kind": "all-reduce", "axis": "other", "bytes": 16.0},
+        {"kind": "collective-permute", "axis": "context", "bytes": 32.0},
     ]
 
 
