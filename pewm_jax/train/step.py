@@ -259,17 +259,17 @@ def trace_step(
     split = sharding.of_batch(mesh)
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=split), clip)
     key = noise_key(config, stage)
-    extra = () if extra is None else (extra,)
+    further = () if extra is None else (extra,)
     step = jax.jit(
         functools.partial(train_step, config, stage),
-        in_shardings=(placed, split, everywhere, *(everywhere for _ in extra)),
+        in_shardings=(placed, split, everywhere, *(everywhere for _ in further)),
         out_shardings=(placed, everywhere),
         donate_argnums=0,
     )
     abstract_key = jax.ShapeDtypeStruct(key.shape, key.dtype, sharding=everywhere)
     kind = target.of_devices(mesh.devices.ravel().tolist())
     with jax.set_mesh(mesh), target.use(kind):  # read by ``nn.placement`` and the kernels
-        return step.trace(state, batch, abstract_key, *extra)
+        return step.trace(state, batch, abstract_key, *further)
 
 
 def compile_step(

@@ -169,7 +169,9 @@ def test_measures_that_cost_are_left_out_in_a_sentence(monkeypatch):
     monkeypatch.setattr(i3d_weights, "installed", lambda: None)
     assert "no weights of I3D are installed" in selection.select_fvd("", 9, accelerator=True)[1]
     monkeypatch.setattr(i3d_weights, "installed", lambda: "there")
-    assert "I3D needs 9 frames, but a clip has 5" in selection.select_fvd("", 5, accelerator=True)[1]
+    assert (
+        "I3D needs 9 frames, but a clip has 5" in selection.select_fvd("", 5, accelerator=True)[1]
+    )
     assert "--fvd on enables them" in selection.select_fvd("", 9, accelerator=False)[1]
     assert selection.select_fvd("off", 9, accelerator=True)[0] is None
     with pytest.raises(UserError, match=r"too short for I3D.*--chain"):
