@@ -52,6 +52,7 @@ def test_another_camera_sees_the_room_that_was_seen(seen, settings):
     assert np.median(np.abs((np.asarray(made.rgb_THWC[0]) + 1) / 2 - colour)) < 0.06
 
 
+@pytest.mark.slow
 def test_a_wall_seen_from_behind_is_not_shown_and_hides_what_is_behind_it():
     """A red wall, seen from its other side; beyond it, a green one, seen from its front."""
     intrinsics = np.array([[12.0, 12.0, 12.0, 12.0]] * 2)

@@ -36,7 +36,7 @@ def test_what_is_looked_at_is_chosen_and_what_is_chosen_is_held(kind):
     assert (found["chosen"] > 0) == (kind != "none")
 
 
-@pytest.mark.slow(but="voxel")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_no_measurement_is_no_surface(kind):
     model = model_of(kind)

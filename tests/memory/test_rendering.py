@@ -114,7 +114,7 @@ def test_every_memory_can_be_rendered(kind):
     assert float(known.mean()) >= alone.mean()
 
 
-@pytest.mark.slow(but="surfels")
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_batch_of_memories_is_rendered_as_one_by_one(kind):
     model = model_of(kind)

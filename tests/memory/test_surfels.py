@@ -92,6 +92,7 @@ def compare(config, memory, held):
         assert not np.asarray(rest)[~valid].any()
 
 
+@pytest.mark.slow
 @examples(15)
 @given(
     seed=st.integers(0, 100_000), keep=st.sampled_from(["mean", "newest"]), protect=st.booleans()

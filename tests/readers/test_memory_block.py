@@ -148,7 +148,7 @@ def test_attention_to_nothing_is_nothing_and_so_is_its_gradient():
     assert np.abs(by_logits[..., some]).min() > 0
 
 
-@pytest.mark.slow(but="sinusoid")
+@pytest.mark.slow
 @BOTH
 def test_masked_tokens_may_hold_anything(positions):
     _, tokens, _ = inputs()

@@ -198,6 +198,7 @@ def test_readers_get_what_they_ask_for():
         assert given == set(wanted.split())
 
 
+@pytest.mark.slow
 @RENDERS
 def test_without_a_memory_there_is_nothing_to_see_but_a_reader_to_train(kind):
     model = model_of(kind, NoMemoryConfig)

@@ -224,6 +224,7 @@ def test_equal_seeds_walk_alike_and_other_seeds_do_not(world, home):
     assert any(np.allclose(begun, pose, atol=1e-6) for pose in starts)
 
 
+@pytest.mark.slow
 def test_where_a_step_is_not_possible_the_block_is_a_turn(world, home, monkeypatch):
     config, params = world
     place = ImaginedEnvironment(config, params, home.context)

@@ -89,6 +89,7 @@ def test_a_memory_hidden_from_all_clips_is_an_empty_one(world):
     assert loss(params, ready, hidden=1.0) == without
 
 
+@pytest.mark.slow
 def test_the_memory_is_hidden_clip_by_clip(world):
     readout = world[1].extras["readout"]
     kept = jnp.array([True, False, True, False])

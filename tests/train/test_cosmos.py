@@ -78,6 +78,7 @@ def test_the_transformer_learns_with_actions_and_the_codec_stands_still(stepped)
     assert first["backbone"]["patch_embed"]["kernel"].shape == (cells * (4 + 1 + 1), 32)
 
 
+@pytest.mark.slow
 def test_its_sums_are_those_of_the_compiled_step(stepped):
     config, stage, *_, text = stepped
     needed = flops.of_stage(config, stage, abstract.clip(config, 2)).total

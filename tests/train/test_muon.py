@@ -103,6 +103,7 @@ def two_stages(folder, **train):
     return fakes.with_stage(config, "joint", steps=4, batch=8, warmup=1, learning_rate=1e-2)
 
 
+@pytest.mark.slow
 def test_a_run_stopped_twice_goes_on_bit_identically(fake_model, tmp_path):
     train(two_stages(tmp_path / "undisturbed"))
     config = two_stages(tmp_path / "stopped", preview_every=1)

@@ -26,7 +26,7 @@ def a_batch(config, rows):
     return jax.tree.map(lambda *x: np.stack(x), *(one(seed) for seed in range(rows)))
 
 
-@pytest.mark.slow(but="0")
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_prepared_batch_has_the_same_loss_without_its_context(number):
     config = tiny_config()

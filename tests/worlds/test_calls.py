@@ -92,6 +92,7 @@ def calls(kind):
     return found
 
 
+@pytest.mark.slow(but=("pewm", "egowm"))
 @EVERY_WORLD
 def test_a_second_eager_call_compiles_nothing(kind):
     for name, call in calls(kind).items():
@@ -126,6 +127,7 @@ def test_many_eager_calls_keep_nothing():
     assert after[2] - before[2] < 40
 
 
+@pytest.mark.slow(but=("pewm", "egowm"))
 @EVERY_WORLD
 def test_eager_and_jitted_calls_are_the_same_program(kind):
     model, params, state = made(kind)
@@ -134,6 +136,7 @@ def test_eager_and_jitted_calls_are_the_same_program(kind):
     equal(eager, jitted)
 
 
+@pytest.mark.slow
 def test_they_can_be_called_under_vmap_and_grad():
     model, params, state = made("pewm")
     plans = jnp.array([GOOD, GOOD[::-1]])
@@ -236,6 +239,7 @@ def test_what_is_no_model_weights_state_or_key_is_refused_in_a_sentence(who, arg
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_keys_of_the_old_kind_are_taken():
     model, params, state = made("pewm")
     old, new = jax.random.PRNGKey(0), KEY
@@ -531,6 +535,7 @@ def test_integer_depth_is_taken_with_its_scale(jitted):
             worlds.start(model, params, given, depth_scale=wrong)
 
 
+@pytest.mark.slow(but=("pewm", "egowm"))
 @EVERY_WORLD
 def test_candidates_and_what_is_not_remembered_share_the_map_of_the_state(kind):
     model, params, state = made(kind)

@@ -42,6 +42,7 @@ def test_frames_come_one_per_action_along_the_integrated_poses(params):
     assert float(jnp.abs(frames.rgb_THWC).max()) <= 1
 
 
+@pytest.mark.slow
 def test_discrete_and_continuous_actions_agree(params):
     state, key = a_state(params), jax.random.key(1)
     moves = action_geometry.continuous(MODEL.actions, ACTIONS)
@@ -72,6 +73,7 @@ def test_the_map_changes_what_is_imagined_unless_ignored(params):
     assert float(jnp.abs(with_map.rgb_THWC - ignored.rgb_THWC).max()) > 1e-3
 
 
+@pytest.mark.slow
 def test_rollout_is_a_pure_function_of_its_arguments_and_vmaps(params):
     states = [a_state(params, s) for s in range(2)]
     keys = jax.random.split(jax.random.key(5), 2)

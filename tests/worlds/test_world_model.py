@@ -48,6 +48,7 @@ def test_fresh_memory_blocks_are_exactly_the_identity(positions):
     np.testing.assert_array_equal(stage1, stage2)
 
 
+@pytest.mark.slow(but="projective")
 @BOTH
 def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
     model, conditioning, tokens, noisy, times = setup(positions)
@@ -103,6 +104,7 @@ def test_moving_cameras_and_map_together_changes_nothing(positions):
     assert np.abs(alone - base).max() > 1e-2 * np.abs(base).max()
 
 
+@pytest.mark.slow
 def test_each_latent_frame_looks_through_its_own_cameras():
     model, conditioning, tokens, noisy, times = setup()
     params = randomise(init_world(model, jax.random.key(0), memory=True))

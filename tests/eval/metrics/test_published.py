@@ -28,7 +28,7 @@ def spoilt(truth, distort, size):
 PER_CLIP = [name for name in metrics.NAMES if name not in (*WITHOUT, "fvd", "kvd")]
 
 
-@pytest.mark.slow(only=("vgg", "src", "mirror"))
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PER_CLIP)
 def test_a_known_distortion_is_ordered_rightly(name):
     metric = metrics.load(name)

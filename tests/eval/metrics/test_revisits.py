@@ -37,6 +37,7 @@ def files(tmp_path_factory):
     return {"src[alex]": folder / "alex.safetensors", "src": folder / "d"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "best"), [("mirror[psnr]", 100), ("mirror[ssim]", 1), ("src[alex]", 100), ("src", 100)]
 )

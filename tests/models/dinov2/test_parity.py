@@ -129,7 +129,7 @@ def patch_tokens(network, batch, dtype=torch.float32):
     return out[:, 1 + registers :].float().numpy().reshape(len(batch), height, width, -1)
 
 
-@pytest.mark.slow(only=("large", "giant"))
+@pytest.mark.slow(only=("base", "large", "giant"))
 def test_patch_tokens_equal_the_reference_at_every_size(pair):
     network, _, (config, params) = pair
     compute = jax.jit(model.apply, static_argnums=0)

@@ -124,6 +124,7 @@ def reference(encoders, images):
     return centred / centred.norm(dim=-1, keepdim=True)
 
 
+@pytest.mark.slow
 def test_the_features_and_distances_equal_the_reference(made):
     folder, encoders = made
     params = dreamsim_weights.read(folder)

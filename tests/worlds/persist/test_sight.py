@@ -61,6 +61,7 @@ def test_a_picture_tells_air_from_surfaces_and_their_colours():
     assert air[4, 3, 3]
 
 
+@pytest.mark.slow
 def test_where_nothing_was_measured_nothing_is_said():
     _, rgb, depth, camera = furnished()
     evidence = persist_sight.seen(ROOM, LOW, rgb, 0 * depth, camera)
@@ -68,6 +69,7 @@ def test_where_nothing_was_measured_nothing_is_said():
     assert (np.asarray(evidence.colour_XYZ) == -1).all()
 
 
+@pytest.mark.slow
 def test_the_light_that_is_read_is_the_light_that_was_drawn():
     grid, rgb, depth, camera = furnished()
     way = unproject(depth, camera) - camera.world_from_camera[:3, 3]
@@ -113,6 +115,7 @@ def test_a_world_begins_on_the_lattice_of_recorded_cells_and_with_what_it_sees()
     np.testing.assert_array_equal(one, two)
 
 
+@pytest.mark.slow
 def test_what_is_seen_decides_between_classes_and_nothing_else_changes():
     classes = MODEL.backbone.voxel_vae.classes  # 13: of the second kind not all colours
     params = jax.jit(lambda: worlds.init(ROOM, jax.random.key(0)))()

@@ -353,7 +353,7 @@ def recorded(count=2):
     return Clip(frames, context, np.ones((count, 1), bool), moves, extras)
 
 
-@pytest.mark.slow(but="camera")
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", worlds.stages(MODEL), ids=lambda stage: stage.name)
 def test_a_stage_learns_what_it_names_from_what_was_prepared(params, stage):
     shapes = jax.eval_shape(lambda: stage.init(MODEL, KEY))

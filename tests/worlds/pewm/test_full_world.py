@@ -120,6 +120,7 @@ def test_text_and_encoder_matter_and_depth_goes_through_the_vae(world):
     assert one.shape == (9, 2, 2, 16)
 
 
+@pytest.mark.slow
 def test_only_an_inverting_vae_divides_the_image_latents_by_its_factor(world):
     _, params = world
     image = np.random.default_rng(2).uniform(-1, 1, (1, 1, 16, 24, 3)).astype(np.float32)

@@ -88,6 +88,7 @@ def test_as_many_frames_are_imagined_as_are_asked_for(params, state, two_clips, 
         np.testing.assert_allclose(frames.depth_THW, rest.depth_THW[:count], rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, LENGTH - 1, LENGTH + 2])
 def test_only_what_was_asked_for_is_remembered(params, state, count):
     after, frames = imagine(MODEL, params, state, MOVES[:count], KEY)
