@@ -157,7 +157,7 @@ def test_things_are_followed_where_the_episodes_have_instance_ids(run, copied, t
         "SCS is not measured, because the episodes have no instance ids"
     )
     assert protocol["scs_segmenter"] is None
-    with pytest.raises(UserError, match=r"evaluate\.scs is flow, and .* collect them with --ids"):
+    with pytest.raises(UserError, match=r"evaluate\.scs is flow, but .* collect them with --ids"):
         report.evaluate(copied, log=lambda _: None, scs="flow")
     write_split(tmp_path / "data" / "revisit", episodes=2, ids=True)
     said = []
@@ -437,7 +437,7 @@ def test_a_rival_that_cannot_be_compared_is_refused(copied, command, capsys, tmp
     short = rival(copied, tmp_path / "short", steps=999)
     said = refused(command, [str(copied), "--none", str(short)], capsys)
     assert "999 steps" in said
-    assert "1000 in all" in said
+    assert "1000 in total" in said
     clip = dataclasses.replace(configs.load(copied / "config.json").model.clip, far_m=9.0)
     other = rival(copied, tmp_path / "other", steps=1000, clip=clip)
     assert "far_m 9.0 there" in refused(command, [str(copied), "--none", str(other)], capsys)
@@ -466,7 +466,7 @@ def test_a_run_without_a_memory_is_scored_and_compared_under_its_own_name(run, t
     both = [m["houses"]["results"] for m in (theirs, metrics)]
     assert content["a"]["clips"]["seen"]["psnr"] == both[0]["memory"]["seen"]["psnr"]
     assert content["b"]["clips"]["seen"]["psnr"] == both[1]["model"]["seen"]["psnr"]
-    assert found.read_text().count("data:image/png") == 1
+    assert found.read_text().count("data:image/png") == 1 + 2 * 8  # and charts, light and dark
     shutil.rmtree(found.parent)
 
 
