@@ -584,7 +584,7 @@ def test_sixty_four_candidates_hold_one_map():
 def test_the_tutorial_compares_many_futures(capsys):
     """Its two blocks run, and give the same; neither copies the map."""
     page = (Path(__file__).parents[2] / "docs" / "tutorial.md").read_text()
-    section = page.split("## Compare many futures\n")[1]
+    section = page.split("## Imagine many candidates\n")[1]
     first, second = re.findall(r"```python\n(.*?)```", section, re.DOTALL)
     names = dict(zip(("config", "params", "state"), made("pewm"), strict=True))
     names |= {"jax": jax, "pewm_jax": pewm_jax}
