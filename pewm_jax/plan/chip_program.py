@@ -36,9 +36,6 @@ ATTENTION, CONVOLUTION, GEMM = "attention", "convolution", "gemm"
 _CALLED = re.compile(r"\b(?:calls|to_apply|called_computations)=\{?%?([\w.$-]+)")
 _BODY = re.compile(r"\bbody=%?([\w.$-]+)")
 _CONDITION = re.compile(r"\bcondition=%?([\w.$-]+)")
-_TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
-_BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
-_EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
 _TARGET = re.compile(r'custom_call_target="([^"]+)"')
 _FUSION = re.compile(r'"fusion_backend_config":\{"kind":"_*([\w$]+)"')
 _SPLASH = re.compile(r"splash_\w+")
@@ -130,7 +127,7 @@ class _Walk:
 
     def _trips(self, line: Line) -> int:
         """Return how often a loop runs, from its annotation or its condition ``i < n``."""
-        if known := _TRIPS.search(line.rest):
+        if known := hlo.TRIPS.search(line.rest):
             return int(known[1])
         condition = _CONDITION.search(line.rest)
         lines = self.computations.get(condition[1], {}) if condition else {}
@@ -178,7 +175,7 @@ class _Walk:
         """
         if line.opcode == "custom-call":
             return _library_kernel(own, line)
-        if line.opcode in ("dot", "convolution"):
+        if line.opcode in hlo.PRODUCTS:
             return _kind(line), f"XLA {line.opcode}"
         if line.opcode != "fusion":
             return None
@@ -272,8 +269,8 @@ def size(shape: str, *, everywhere: bool = False) -> float:
 
 
 def _branches(line: Line) -> list[str]:
-    branches = _BRANCHES.search(line.rest)
-    return re.findall(r"[\w.$-]+", branches[1]) if branches else _EITHER.findall(line.rest)
+    branches = hlo.BRANCHES.search(line.rest)
+    return re.findall(r"[\w.$-]+", branches[1]) if branches else hlo.EITHER.findall(line.rest)
 
 
 def _kind(product: Line) -> str:

@@ -23,9 +23,10 @@ PRODUCTS = ("dot", "convolution")
 """Operations that are matrix products or convolutions."""
 
 _CALLED = re.compile(r"\b(?:calls|to_apply|body)=%?([\w.$-]+)")
-_BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
-_EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
-_TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
+BRANCHES = re.compile(r"branch_computations=\{([^}]*)\}")
+EITHER = re.compile(r"\b(?:true|false)_computation=%?([\w.$-]+)")
+TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"\}')
+"""How an instruction names its branches, and how often a loop runs."""
 BITS = {"pred": 8, "s4": 4, "u4": 4, "bf16": 16, "c64": 64, "c128": 128}
 """Bits of the types whose name does not state them."""
 
@@ -179,13 +180,13 @@ def read(text: str) -> Program:
 def _inside(line: Line, walk) -> Iterator[tuple]:
     """Yield the work of the computations that an instruction calls, with counts (0: unknown)."""
     if line.opcode == "while":
-        trips = _TRIPS.search(line.rest)
+        trips = TRIPS.search(line.rest)
         body = _CALLED.search(line.rest)
         if body:
             yield walk(body[1]), int(trips[1]) if trips else 0
     elif line.opcode == "conditional":
-        branches = _BRANCHES.search(line.rest)
-        names = re.findall(r"[\w.$-]+", branches[1]) if branches else _EITHER.findall(line.rest)
+        branches = BRANCHES.search(line.rest)
+        names = re.findall(r"[\w.$-]+", branches[1]) if branches else EITHER.findall(line.rest)
         costs = [walk(name) for name in names]
         if costs:
             yield max(costs, key=lambda cost: sum(product.flops for product in cost[0])), 1
