@@ -18,6 +18,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,7 @@ def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> Stage
         "stage": stage,
         "chip": chip.name,
         "devices": devices,
+        "parent": os.getpid(),
     }
     with tempfile.TemporaryDirectory(prefix="pewm-plan-") as folder:
         asked, answered = Path(folder) / "request.json", Path(folder) / "report.json"
@@ -169,6 +171,7 @@ def _plugins(config: Any) -> list[tuple[str, str]]:
 def main(asked: str, answered: str) -> None:
     """Answer a request of ``compile_stage``: read its file and write the report's."""
     request = json.loads(Path(asked).read_text())
+    threading.Thread(target=_exit_after, args=(request["parent"],), daemon=True).start()
     try:
         for name, file in request["plugins"]:
             _load(name, file)
@@ -178,6 +181,13 @@ def main(asked: str, answered: str) -> None:
     except UserError as error:
         answer = {"error": str(error)}
     Path(answered).write_text(json.dumps(answer))
+
+
+def _exit_after(parent: int) -> None:
+    """End this process once its parent has ended, even if it was killed."""
+    while os.getppid() == parent:
+        time.sleep(0.5)
+    os._exit(1)
 
 
 def _load(name: str, file: str) -> None:

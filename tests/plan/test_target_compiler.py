@@ -316,3 +316,13 @@ def test_a_tiny_step_is_compiled_for_a_chip_that_is_not_there(tmp_path, chip):
     assert {item["axis"] for item in stage.collectives} == {"data"}
     assert "fits: " in done.stdout
     assert dataclasses.asdict(stage)["compiler"]["version"]
+
+
+def test_a_compilation_ends_with_the_process_that_asked_for_it():
+    code = (
+        "import os, time\n"
+        "from pewm_jax.plan import target_compiler\n"
+        f"target_compiler._exit_after({os.getpid() + 1})\n"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], timeout=120, check=False)
+    assert ended.returncode == 1
