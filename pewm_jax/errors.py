@@ -1,10 +1,11 @@
-"""Errors that refuse a setting, or other user input, in one sentence; how commands report them."""
+"""Errors that refuse a setting, or other user input, in one sentence, and their exit codes."""
 
 from __future__ import annotations
 
 import errno
 import re
 import sys
+from collections.abc import Callable
 from typing import Any
 
 
@@ -22,11 +23,18 @@ def require(condition: bool, sentence: str) -> None:
         raise ConfigError(sentence)
 
 
-def require_positive(section: Any, where: str, *names: str) -> None:
-    """Refuse sizes and counts below 1; the message names the field."""
+def require_fields(
+    section: Any, where: str, accepts: Callable[[Any], bool], hint: str, *names: str
+) -> None:
+    """Refuse fields whose value is not accepted: "``where``.name is value: use ``hint``."."""
     for name in names:
         value = getattr(section, name)
-        require(value >= 1, f"{where}.{name} is {value}: use at least 1.")
+        require(accepts(value), f"{where}.{name} is {value}: use {hint}.")
+
+
+def require_positive(section: Any, where: str, *names: str) -> None:
+    """Refuse sizes and counts below 1; the message names the field."""
+    require_fields(section, where, lambda value: value >= 1, "at least 1", *names)
 
 
 def is_pattern(text: str) -> bool:
@@ -39,11 +47,10 @@ def is_pattern(text: str) -> bool:
 
 
 def report(error: UserError | OSError | KeyboardInterrupt) -> int:
-    """Print an error as one sentence on stderr.
+    """Print an error as one sentence on stderr, and return the exit code.
 
-    Returns:
-        The exit code: 2 for bad input and for files that cannot be used; 130, or the error's
-        ``exit_code``, for an interruption.
+    The code is 2 for bad input and for files that cannot be used; 130, or the error's
+    ``exit_code``, for an interruption.
     """
     if isinstance(error, KeyboardInterrupt):
         print(str(error) or "Interrupted.", file=sys.stderr)
@@ -54,7 +61,7 @@ def report(error: UserError | OSError | KeyboardInterrupt) -> int:
 
 
 def _file_sentence(error: OSError) -> str:
-    """Return a sentence: which file could not be used, why, and what to do."""
+    """Return a sentence: the file that could not be used, the reason, and what to do."""
     where = f"{error.filename}: " if error.filename else ""
     if error.errno in {errno.ENOSPC, errno.EDQUOT}:
         fix = "free some space there"

@@ -1,7 +1,7 @@
-"""The registry of kinds: which classes a section of a model may hold, by name.
+"""The registry of kinds: the classes that a section of a model may hold, by name.
 
 A model consists of parts: a backbone, a codec, a control, a memory with its encoder and reader, a
-noise; a world puts them together. Each part comes in several kinds. A kind is one class: a frozen
+noise; a world assembles them. Each part comes in several kinds. A kind is one class: a frozen
 dataclass whose fields are its settings and whose methods are its functions. Its base class in
 ``pewm_jax.config.parts`` documents the methods. A decorator registers it::
 
@@ -12,10 +12,9 @@ dataclass whose fields are its settings and whose methods are its functions. Its
 
         def encode(self, params, video_BTHWC, *, condition=False): ...
 
-In JSON, a section names its kind: ``{"codec": {"kind": "turn", "spatial": 8}}``. Built-in kinds
-stand in ``BUILT_IN`` and are imported when they are first used. When a name is not known, the
-modules of the entry-point group ``pewm_jax.kinds`` are imported, by which installed packages
-register kinds of their own.
+In JSON, a section names its kind: ``{"codec": {"kind": "turn", "spatial": 8}}``. Built-in kinds are
+listed in ``BUILT_IN`` and imported when they are first used. If a name is unknown, the modules of
+the entry-point group ``pewm_jax.kinds`` are imported, by which installed packages register kinds.
 """
 
 from __future__ import annotations
@@ -42,14 +41,7 @@ class Settings:
     SECTION: ClassVar[str] = ""
 
     def check(self, model: Any) -> None:
-        """Refuse a model that these settings do not fit into; called when a model is built.
-
-        Args:
-            model: the model that they are part of.
-
-        Raises:
-            ConfigError: they do not fit.
-        """
+        """Refuse a model that these settings do not fit with a ``ConfigError``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,11 +95,11 @@ BUILT_IN: dict[str, dict[str, str]] = {
     "reader": {
         "attend": "pewm_jax.readers.attention:AttentionConfig",
         "render": "pewm_jax.readers.render:RenderConfig",
-        "both": "pewm_jax.readers.both:BothConfig",
+        "both": "pewm_jax.readers.render:BothConfig",
     },
     "memory": {
         "voxel": "pewm_jax.memory.voxel_map:VoxelConfig",
-        "map2d": "pewm_jax.memory.map2d:Map2DConfig",
+        "map2d": "pewm_jax.memory.voxel_map:Map2DConfig",
         "points": "pewm_jax.memory.points:PointsConfig",
         "surfels": "pewm_jax.memory.surfels:SurfelConfig",
         "grid": "pewm_jax.memory.class_grid:GridConfig",
@@ -132,21 +124,18 @@ def register(section: str, name: str, settings: type | None = None, where: Any =
     """Register a kind, by a call or as a decorator: ``@register("codec", "turn")``.
 
     Registering the same class again replaces it: the same object, or the class that a notebook's
-    cell or a reloaded module defines again. A file that is run as two modules registers the class
-    of the first.
+    cell or a reloaded module defines again. A file that runs as two modules registers the class of
+    the first.
 
     Args:
         section: the part of a model, such as ``backbone``.
         name: the kind's name in JSON and flags.
-        settings: a frozen dataclass, subclass of the section's interface; None makes a decorator.
+        settings: a frozen dataclass, subclass of the section's interface; None returns a decorator.
         where: deprecated: a module with the functions of the kind, its name or another object.
 
-    Returns:
-        The class, or the decorator.
-
     Raises:
-        ConfigError: the class is not a frozen dataclass or is of another section, or the name is
-            taken by another class.
+        ConfigError: the class is not a frozen dataclass or is of another section, lacks methods, or
+            the name is taken by another class.
     """
     if settings is None:
         return lambda decorated: register(section, name, decorated)
@@ -216,7 +205,7 @@ _OF_THE_MODEL = {("backbone", "observed"), ("control", "init"), ("control", "con
 
 
 def _add_methods(section: str, name: str, settings: type, where: Any) -> None:
-    """Make the functions of a module, as version 0.1 had them, methods of the settings."""
+    """Turn the functions of a module, as in version 0.1, into methods of the settings."""
     warnings.warn(
         f"register({section!r}, …) with a module of functions is deprecated: make them methods "
         f"of {settings.__name__}, as pewm_jax.config documents them.",
@@ -237,7 +226,7 @@ def _add_methods(section: str, name: str, settings: type, where: Any) -> None:
 
 
 def _method(find: Any, function: str, inherited: Any, *, of_model: bool) -> Any:
-    """Return a method that calls a module's function; the inherited one if there is none."""
+    """Return a method that calls a module's function, or the inherited method without one."""
 
     def call(self: Any, *args: Any, **named: Any) -> Any:
         own = find(function)
@@ -249,16 +238,11 @@ def _method(find: Any, function: str, inherited: Any, *, of_model: bool) -> Any:
 
 
 def part(section: str, name: str, **settings: Any) -> Any:
-    """Return a dataclass field whose default is made when a value is needed.
+    """Return a dataclass field whose default is created when a value is needed.
 
     ``codec: Codec = part("codec", "pixel")`` imports the pixel codec only when a model without
-    another codec is built.
-
-    Args:
-        section: the part of a model.
-        name: the kind of the default.
-        settings: of the default, where they differ from the kind's own; parts among them are made
-            by ``part``, too.
+    another codec is built. ``settings`` are those of the default that differ from the kind's own;
+    parts among them are also created by ``part``.
     """
 
     def make() -> Any:
@@ -290,10 +274,7 @@ def _address(settings: type) -> str:
 
 
 def _same(one: type, other: type) -> bool:
-    """Tell whether two classes are one, or the same definition run twice.
-
-    A file that is imported by its name and by ``--plugin`` is run twice, as two modules.
-    """
+    """Tell whether two classes are one, or one definition in a file that runs as two modules."""
     if one.__qualname__ != other.__qualname__:
         return False
     files = [_file(kind) for kind in (one, other)]
@@ -312,7 +293,7 @@ def names(section: str) -> list[str]:
 
 
 def named(section: str, name: str) -> Kind:
-    """Return a kind by its name; if it is not known, import the modules of entry points first.
+    """Return a kind by its name; if it is unknown, import the modules of entry points first.
 
     Raises:
         ConfigError: there is no such kind; the message lists the known ones, and the modules of
@@ -338,7 +319,7 @@ def named(section: str, name: str) -> Kind:
 
 
 def _import_entry_points() -> list[str]:
-    """Import the modules that installed packages name, each once; return what went wrong."""
+    """Import each module that installed packages name, once; return the errors."""
     failed = []
     for point in metadata.entry_points(group=GROUP):
         if point.module in _ENTERED:
@@ -353,11 +334,7 @@ def _import_entry_points() -> list[str]:
 
 
 def imported(name: str, what: str) -> Any:
-    """Import a module of a user's.
-
-    Args:
-        name: its name.
-        what: what asks for it, for the error message.
+    """Import a user's module; ``what`` needs it and is named in the error.
 
     Raises:
         ConfigError: it cannot be imported, for whatever reason.
@@ -373,7 +350,7 @@ def imported(name: str, what: str) -> Any:
 
 
 def of(settings: Any) -> Kind:
-    """Return the kind that settings are of, by their type.
+    """Return the kind of settings, by their type.
 
     Raises:
         ConfigError: their type is not registered.
@@ -395,15 +372,9 @@ def of(settings: Any) -> Kind:
 
 
 def require_section(value: Any, section: str, where: str) -> None:
-    """Refuse what are not settings of a section, also in the sections below it.
+    """Refuse a value that is not settings of a section, also in the sections below it.
 
-    Args:
-        value: what was given.
-        section: that it must be of.
-        where: its name in the error message.
-
-    Raises:
-        ConfigError: in one sentence.
+    ``where`` is its name in the error.
     """
     given = not isinstance(value, type) and dataclasses.is_dataclass(value)
     if not given or getattr(value, "SECTION", None) != section:

@@ -74,7 +74,7 @@ class Control:
         camera: cameras of leading shape (..., T): the observed frame's, then those to imagine.
         actions_TA: (..., T − 1, A) actions, or None if only cameras are known.
         state_A: (..., A) the agent's own state at the observed frame, such as the angles of its
-            joints; None if it is not known.
+            joints; None if it is unknown.
     """
 
     camera: Camera
@@ -111,6 +111,13 @@ class Clip:
     context_valid_S: Array
     actions_TA: Array | None = None
     extras: dict[str, Any] = dataclasses.field(default_factory=dict)
+
+    def without_context(self) -> Clip:
+        """Return a batch of clips with S = 0 context frames."""
+        context = jax.tree.map(lambda x: x[:, :0], self.context)
+        return dataclasses.replace(
+            self, context=context, context_valid_S=self.context_valid_S[:, :0]
+        )
 
     def with_extras(self, **arrays: Any) -> Clip:
         """Return the clip with extras added or replaced; None removes one."""
@@ -165,7 +172,7 @@ class View:
     Attributes:
         features_THWF: (..., T, H, W, F) features of the nearest point at each pixel, 0 without one.
         depth_THW: (..., T, H, W) its depth along z, metres, 0 without one; where only the back of
-            something is known, which shows nothing, the depth of that.
+            something is known, which is not seen, the depth of that.
         seen_THW: (..., T, H, W) bool, whether a point is seen at the pixel.
     """
 
@@ -177,7 +184,7 @@ class View:
 @_pytree
 @dataclasses.dataclass(frozen=True)
 class EncodedView:
-    """The images of T cameras as the codec encodes them, any leading shape before t or T.
+    """The images of T cameras as latents of the codec, any leading shape before t or T.
 
     Attributes:
         latents_thwC: (..., t, h, w, C) latents of colour and depth, holes filled.
@@ -191,11 +198,11 @@ class EncodedView:
 @_pytree
 @dataclasses.dataclass(frozen=True)
 class MemoryReadout:
-    """What a memory shows one clip, or each clip of a batch; what is not asked for is None.
+    """A memory's readout for one clip, or each clip of a batch; unused parts are None.
 
     Attributes:
         tokens: the points that the clip's cameras see, for attention.
-        view: what the memory looks like from each of the clip's cameras, at the clip's size.
+        view: the memory rendered for each of the clip's cameras, at the clip's size.
         encoded: the same, encoded by the codec.
     """
 

@@ -27,6 +27,27 @@ def test_every_new_name_exists_and_no_old_one_does():
     assert [old for old in _moved.MOVED if exists(old)] == []
 
 
+IMPLIED = """
+commands.demo commands.evaluate commands.horizon commands.main commands.play commands.train
+evaluation.codec_score evaluation.compare evaluation.gallery evaluation.horizon evaluation.intervals
+evaluation.long_rollouts evaluation.metrics evaluation.metrics.perceptual
+evaluation.metrics.revisits evaluation.metrics.sam2 evaluation.metrics.structure
+evaluation.metrics.videos evaluation.mirror evaluation.preview evaluation.protocol
+evaluation.reproject evaluation.scoring evaluation.seen evaluation.statistics evaluation.steering
+scaling.hlo scaling.plan scaling.suggest training.checkpoint training.chips training.feed
+training.loading training.log training.loop training.optimizer training.processes training.runs
+training.sharding training.signals training.stages training.step training.watch
+"""
+"""Modules that are found by the row of their package."""
+
+
+def test_every_module_below_a_renamed_package_exists():
+    found = [
+        _moved.new_name(f"pewm_jax.{old}").removeprefix("pewm_jax.") for old in IMPLIED.split()
+    ]
+    assert [new for new in found if not exists(new)] == []
+
+
 def test_nothing_in_the_package_imports_an_old_name():
     found = []
     for path in (ROOT / "pewm_jax").rglob("*.py"):

@@ -1,17 +1,16 @@
-"""The learned codec: a small convolutional autoencoder, frame by frame, 8 × 8 pixels to a cell.
+"""The learned codec: a small convolutional autoencoder of single frames, 8 × 8 pixels per cell.
 
-Space-to-depth brings 4 × 4 pixels into the channels; residual blocks of 3 × 3 convolutions work at
-a quarter and at an eighth of the resolution; the decoder is the mirror image. Beside them a linear
-map leads straight from a cell's pixels to its latents, and one back: by itself it soon finds the
-principal components, and the networks learn what these leave. Nothing is normalised over space, so
-frames of any size and number are encoded alike. Latents leave with mean 0 and
-variance 1 per channel, once ``latent_mean_C`` and ``latent_scale_C`` are fitted (``worlds.codec``).
+Space-to-depth moves 4 × 4 pixels into the channels. Residual blocks of 3 × 3 convolutions follow at
+a quarter and at an eighth of the resolution; the decoder is the mirror image. A linear map from a
+cell's pixels to its latents, and one back, run in parallel: they learn the principal components,
+and the networks learn the rest. Nothing is normalised over space, so frames of any size and number
+are encoded alike. Latents have mean 0 and variance 1 per channel once ``latent_mean_C`` and
+``latent_scale_C`` are fitted (``worlds.codec``).
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import ClassVar
 
 import jax
@@ -19,9 +18,14 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs import gates
+from pewm_jax.codecs.gates import (
+    convolve_layer,
+    depth_to_space,
+    residual_block,
+    space_to_depth,
+)
 from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.errors import UserError, require, require_positive
-from pewm_jax.nn.convolution import convolve
 from pewm_jax.types import Array, Params
 
 PATCH = 4
@@ -38,9 +42,11 @@ _STATISTICS = ("latent_mean_C", "latent_scale_C")
 class LearnedCodecConfig(Codec):
     """8 × 8 pixels of one frame to a few channels; trained by the world `codec`.
 
-    Depth is seen as a grey picture by the same weights. A model that has this codec starts from
-    trained weights: `--train.start runs/codec --train.fresh 'memory/.*' 'backbone/.*' 'control/.*'`
-    takes the codec of that run and begins all else at random.
+    Depth is encoded as a grey image by the same weights. A model with this codec starts from
+    trained
+    weights: `--train.start runs/codec --train.fresh 'memory/.*' 'backbone/.*' 'control/.*'` takes
+        the
+    codec of that run and initializes all other parameters at random.
     """
 
     SHARDING: ClassVar[Rules] = (
@@ -99,15 +105,8 @@ class LearnedCodecConfig(Codec):
         params: Params = {
             "latent_mean_C": jnp.zeros((self.latent_channels,)),
             "latent_scale_C": jnp.ones((self.latent_channels,)),
+            **gates.init_convolutions(self.layout(), key, zero=("two",)),
         }
-        for number, (path, ((side, width, out), _)) in enumerate(self.layout().items()):
-            *folders, name = path.split("/")
-            node = params
-            for folder in folders:
-                node = node.setdefault(folder, {})
-            drawn = jax.random.normal(jax.random.fold_in(key, number), (side, side, width, out))
-            gain = 0.0 if name == "two" else 1 / math.sqrt(side * side * width)
-            node[name] = {"kernel": gain * drawn, "bias": jnp.zeros((out,))}
         if self.gate:
             params["gate"] = gates.init(self.gate, jax.random.fold_in(key, GATE))
         return params
@@ -131,7 +130,7 @@ class LearnedCodecConfig(Codec):
     def mix(
         self, params: Params, decoded_NHWC: Array, rendered_NHWC: Array, seen_NHW: Array
     ) -> Array:
-        """Mix decoded and rendered pictures (N, H, W, 4) by the gate; see ``gates.apply``."""
+        """Blend decoded and rendered frames (N, H, W, 4) by the gate; see ``gates.apply``."""
         return gates.apply(params["gate"], decoded_NHWC, rendered_NHWC, seen_NHW)
 
     def encode_raw(self, params: Params, video_BTHWC: Array) -> Array:
@@ -146,84 +145,55 @@ class LearnedCodecConfig(Codec):
             )
         weights = params["encoder"]
         pixels = video_BTHWC.reshape(-1, height, width, colours)
-        x = _convolve(weights["into"], _gather(pixels, PATCH))
+        x = convolve_layer(weights["into"], space_to_depth(pixels, PATCH))
         x = _blocks(weights, "fine", self.fine_blocks, x)
-        x = _convolve(weights["down"], _gather(x, 2))
+        x = convolve_layer(weights["down"], space_to_depth(x, 2))
         x = _blocks(weights, "coarse", self.coarse_blocks, x)
-        x = _convolve(weights["out"], jax.nn.silu(x))
-        x = x + _convolve(weights["direct"], _gather(pixels, cell))
+        x = convolve_layer(weights["out"], jax.nn.silu(x))
+        x = x + convolve_layer(weights["direct"], space_to_depth(pixels, cell))
         return x.reshape(*lead, *x.shape[1:])
 
     def decode_raw(self, params: Params, latents_BthwC: Array) -> Array:
         """Decode latents that are not normalised; see ``decode``."""
         weights, lead = params["decoder"], latents_BthwC.shape[:-3]
         latents = latents_BthwC.reshape(-1, *latents_BthwC.shape[-3:])
-        x = _convolve(weights["into"], latents)
+        x = convolve_layer(weights["into"], latents)
         x = _blocks(weights, "coarse", self.coarse_blocks, x)
-        x = _spread(_convolve(weights["up"], x), 2)
+        x = depth_to_space(convolve_layer(weights["up"], x), 2)
         x = _blocks(weights, "fine", self.fine_blocks, x)
-        x = _spread(_convolve(weights["out"], jax.nn.silu(x)), PATCH)
-        x = x + _spread(_convolve(weights["direct"], latents), self.spatial)
+        x = depth_to_space(convolve_layer(weights["out"], jax.nn.silu(x)), PATCH)
+        x = x + depth_to_space(convolve_layer(weights["direct"], latents), self.spatial)
         return x.reshape(*lead, *x.shape[1:])
 
-    def layout(self) -> dict[str, tuple[tuple[int, int, int], int]]:
-        """Return every convolution by path: (side, channels in, channels out), pixels per cell."""
+    def layout(self) -> gates.Layout:
+        """Return the layout of every convolution."""
         a, b, c, pixels = self.fine, self.coarse, self.latent_channels, COLOURS * PATCH**2
 
-        def blocks(where: str, name: str, count: int, width: int, cell: int) -> dict:
+        def blocks(where: str, name: str, count: int, width: int) -> gates.Layout:
             return {
-                f"{where}/{name}_{i}/{part}": ((3, width, width), cell)
+                f"{where}/{name}_{i}/{part}": (3, width, width)
                 for i in range(count)
                 for part in ("one", "two")
             }
 
-        cell = 2 * PATCH
         return {
-            "encoder/direct": ((1, COLOURS * cell**2, c), cell),
-            "decoder/direct": ((1, c, COLOURS * cell**2), cell),
-            "encoder/into": ((3, pixels, a), PATCH),
-            **blocks("encoder", "fine", self.fine_blocks, a, PATCH),
-            "encoder/down": ((1, 4 * a, b), cell),
-            **blocks("encoder", "coarse", self.coarse_blocks, b, cell),
-            "encoder/out": ((3, b, c), cell),
-            "decoder/into": ((3, c, b), cell),
-            **blocks("decoder", "coarse", self.coarse_blocks, b, cell),
-            "decoder/up": ((1, b, 4 * a), cell),
-            **blocks("decoder", "fine", self.fine_blocks, a, PATCH),
-            "decoder/out": ((3, a, pixels), PATCH),
+            "encoder/direct": (1, COLOURS * self.spatial**2, c),
+            "decoder/direct": (1, c, COLOURS * self.spatial**2),
+            "encoder/into": (3, pixels, a),
+            **blocks("encoder", "fine", self.fine_blocks, a),
+            "encoder/down": (1, 4 * a, b),
+            **blocks("encoder", "coarse", self.coarse_blocks, b),
+            "encoder/out": (3, b, c),
+            "decoder/into": (3, c, b),
+            **blocks("decoder", "coarse", self.coarse_blocks, b),
+            "decoder/up": (1, b, 4 * a),
+            **blocks("decoder", "fine", self.fine_blocks, a),
+            "decoder/out": (3, a, pixels),
         }
 
 
-def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:
-    """Return the codec's parameters with the mean and the standard deviation of its latents."""
-    return {**params, "latent_mean_C": mean_C, "latent_scale_C": scale_C}
-
-
 def _blocks(weights: Params, name: str, count: int, x_NHWC: Array) -> Array:
+    """Apply the residual blocks of a name, one after the other."""
     for i in range(count):
-        block = weights[f"{name}_{i}"]
-        inner = _convolve(block["one"], jax.nn.silu(x_NHWC))
-        x_NHWC = x_NHWC + _convolve(block["two"], jax.nn.silu(inner))
+        x_NHWC = residual_block(weights[f"{name}_{i}"], x_NHWC)
     return x_NHWC
-
-
-def _convolve(weights: Params, x_NHWC: Array) -> Array:
-    """Convolve, with zeros around the frame."""
-    kernel, bias = (weights[name].astype(x_NHWC.dtype) for name in ("kernel", "bias"))
-    if kernel.shape[0] == 1:
-        return x_NHWC @ kernel[0, 0] + bias
-    return convolve(x_NHWC, kernel) + bias
-
-
-def _gather(x_NHWC: Array, s: int) -> Array:
-    """Bring s × s cells into the channels of one."""
-    n, height, width, c = x_NHWC.shape
-    x = x_NHWC.reshape(n, height // s, s, width // s, s, c).transpose(0, 1, 3, 2, 4, 5)
-    return x.reshape(n, height // s, width // s, s * s * c)
-
-
-def _spread(x_NHWC: Array, s: int) -> Array:
-    """Invert ``_gather``."""
-    n, h, w, c = x_NHWC.shape
-    x = x_NHWC.reshape(n, h, w, s, s, c // (s * s)).transpose(0, 1, 3, 2, 4, 5)
-    return x.reshape(n, h * s, w * s, c // (s * s))

@@ -49,16 +49,7 @@ class PixelConfig(Codec):
         return fold(video_BTHWC, self.spatial, self.temporal)
 
     def decode(self, params: Params, latents_BthwC: Array) -> Array:
-        """Invert ``encode``; the q copies of the first frame are averaged.
-
-        Args:
-            self: the codec.
-            params: none.
-            latents_BthwC: (B, k + 1, h, w, q·s·s·C).
-
-        Returns:
-            (B, q·k + 1, h·s, w·s, C) video.
-        """
+        """Invert ``encode``; the q copies of the first frame are averaged."""
         del params
         batch, latent_frames, h, w, width = latents_BthwC.shape
         s, q = self.spatial, self.temporal
@@ -70,7 +61,7 @@ class PixelConfig(Codec):
 
 
 def fold(video_BTHWC: Array, spatial: int, temporal: int) -> Array:
-    """Gather s × s pixels of q frames into the channels of one latent cell.
+    """Move s × s pixels of q frames into the channels of one latent cell.
 
     Args:
         video_BTHWC: (B, q·k + 1, H, W, C) float.

@@ -1,4 +1,4 @@
-"""Encode and decode colour and depth with a model's codec, and mix frames with rendered ones."""
+"""Colour and depth of frames to latents and back with a model's codec, and its gate."""
 
 from __future__ import annotations
 
@@ -24,17 +24,11 @@ def encode_rgbd(
     *,
     condition: bool = False,
 ) -> Array:
-    """Encode colour in [−1, 1] and metric depth separately and concatenate the channels.
+    """Encode colour (B, T, H, W, 3) in [−1, 1] and depth, metres, and concatenate the channels.
 
-    No measurement is not a surface: a pixel without depth is encoded with that of the nearest pixel
-    that has one, and an image without any at ``clip.far_m``. ``measured`` says what to count.
-
-    Args:
-        model: the model.
-        params: the world model's parameters; those of the codec are under ``codec``.
-        rgb_BTHWC: (B, T, H, W, 3).
-        depth_BTHW: (B, T, H, W) metres.
-        condition: see ``Codec.encode``.
+    Pixels without depth get that of the nearest measured pixel, and an image without any
+    ``clip.far_m``; ``measured`` returns the weights. ``params`` are the world model's;
+    ``condition`` is that of ``Codec.encode``.
     """
     weights = params.get("codec", {})
     if not model.codec.depth_channels:
@@ -62,7 +56,7 @@ def encode_rgbd(
 
 
 def _clip_by_clip(encoded: Callable[..., Array], weights: Params, *videos: Array) -> Array:
-    """Encode clip by clip where it is compiled, so that memory does not grow with the batch."""
+    """Encode clip by clip if traced, so that memory use does not grow with the batch."""
 
     def one_by_one(weights: Params, *videos: Array) -> Array:
         if len(videos[0]) == 1:
@@ -77,7 +71,7 @@ def _clip_by_clip(encoded: Callable[..., Array], weights: Params, *videos: Array
 def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
     """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W).
 
-    Where depth is not encoded it is 0 everywhere: not known.
+    Depth is 0, unknown, if the codec does not encode it.
     """
     if not model.codec.depth_channels:
         latents = latents_BthwC.astype(jnp.dtype(model.dtype))
@@ -97,7 +91,7 @@ def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> 
 def mix(
     model: AssembledModel, params: Params, rgb_BTHWC: Array, depth_BTHW: Array, view: View
 ) -> tuple[Array, Array]:
-    """Mix decoded frames with what the memory looks like from their cameras, by the codec's gate.
+    """Blend decoded frames with the rendered memory by the codec's gate.
 
     Args:
         model: the model, whose codec has a gate.
@@ -107,7 +101,7 @@ def mix(
         view: (B, T) the rendered memory; the first 3 of its features are colours.
 
     Returns:
-        Colours and depth; those given where nothing is rendered.
+        Colours and depth, unchanged where nothing is rendered.
     """
 
     def pictures(rgb: Array, depth: Array) -> Array:
@@ -128,8 +122,7 @@ def measured(model: AssembledModel, depth_BTHW: Array) -> Array:
     """Return the share of measured pixels in each depth latent, the weight of its error.
 
     The shape (B, t, h, w, C) broadcasts with the depth channels of ``encode_rgbd``. If a channel is
-    one pixel, as in the pixel codec, the share is 0 or 1. Otherwise it is the mean over the
-    latent's pixels.
+    one pixel, as in the pixel codec, the share is 0 or 1, else the mean over the latent's pixels.
     """
     own = model.codec.measured(depth_BTHW)
     if own is not None:

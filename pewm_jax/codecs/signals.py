@@ -39,11 +39,8 @@ def signal_from_rgb(rgb: Array) -> Array:
 def rgb_from_signal(signal: Array) -> Array:
     """Map floats in [−1, 1] to uint8 colours, rounded and clipped.
 
-    Args:
-        signal: colours of any shape.
-
     Raises:
-        UserError: it is no array of numbers, or not finite.
+        UserError: the signal is not an array of numbers, or not finite.
     """
     require_array("rgb_from_signal", "signal", signal, ...)
     return jnp.round(jnp.clip((signal + 1) * 127.5, 0, 255)).astype(jnp.uint8)

@@ -9,10 +9,8 @@ import warnings
 from typing import Any
 
 from pewm_jax.config.assembled import AssembledModel
-from pewm_jax.config.clip import SMALLEST, ActionConfig, ClipConfig
 from pewm_jax.config.experiment import VERSION, Config
 from pewm_jax.config.launch import Join, Launch
-from pewm_jax.config.mesh import AXES, MeshConfig
 from pewm_jax.config.migrations import upgrade
 from pewm_jax.config.parts import (
     Backbone,
@@ -25,8 +23,26 @@ from pewm_jax.config.parts import (
     Reader,
 )
 from pewm_jax.config.serialize import from_dict, load, save, to_dict
-from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig, TrainSettings
-from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, Task, World
+from pewm_jax.config.training import (
+    AXES,
+    DataConfig,
+    EvalConfig,
+    MeshConfig,
+    StageConfig,
+    TrainConfig,
+    TrainSettings,
+)
+from pewm_jax.config.world import (
+    SMALLEST,
+    ActionConfig,
+    ArraySpec,
+    BatchSpec,
+    Capabilities,
+    ClipConfig,
+    Facts,
+    Task,
+    World,
+)
 from pewm_jax.errors import ConfigError, UserError
 from pewm_jax.registry import Settings, register
 
@@ -73,7 +89,7 @@ __all__ = [
 
 _MOVED = {
     "VoxelConfig": "pewm_jax.memory.voxel_map",
-    "Map2DConfig": "pewm_jax.memory.map2d",
+    "Map2DConfig": "pewm_jax.memory.voxel_map",
     "PointsConfig": "pewm_jax.memory.points",
     "SurfelConfig": "pewm_jax.memory.surfels",
     "GridConfig": "pewm_jax.memory.class_grid",
@@ -81,7 +97,7 @@ _MOVED = {
     "NoMemoryConfig": "pewm_jax.memory.none",
     "AttentionConfig": "pewm_jax.readers.attention",
     "RenderConfig": "pewm_jax.readers.render",
-    "BothConfig": "pewm_jax.readers.both",
+    "BothConfig": "pewm_jax.readers.render",
     "WanVAEConfig": "pewm_jax.models.wan.codec:WanVAECodec",
     "CosmosConfig": "pewm_jax.models.cosmos.backbone:CosmosBackbone",
     "SVDVAEConfig": "pewm_jax.models.svd.vae_codec:SVDVAECodec",

@@ -1,13 +1,20 @@
-"""The settings of a world that is assembled from parts, as the code of the parts uses them."""
+"""The settings of a world that is assembled from parts."""
 
 from __future__ import annotations
 
 import dataclasses
 from typing import TYPE_CHECKING, Any, Literal
 
-from pewm_jax.config.clip import ActionConfig, ClipConfig
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
-from pewm_jax.config.world import ArraySpec, BatchSpec, Capabilities, Facts, World
+from pewm_jax.config.world import (
+    ActionConfig,
+    ArraySpec,
+    BatchSpec,
+    Capabilities,
+    ClipConfig,
+    Facts,
+    World,
+)
 from pewm_jax.errors import require
 from pewm_jax.registry import of, part, require_section
 
@@ -21,7 +28,7 @@ if TYPE_CHECKING:
 class AssembledModel(World):
     """Base class of the worlds that are assembled from parts.
 
-    A backbone denoises the latents of a codec; a control steers it, and a memory is read by it.
+    A backbone denoises the latents of a codec, steered by a control; a reader reads a memory.
     """
 
     clip: ClipConfig = ClipConfig()
@@ -48,7 +55,7 @@ class AssembledModel(World):
 
     @property
     def in_channels(self) -> int:
-        """Input channels of the denoiser: noisy latents, the observed frames', the control's."""
+        """Input channels of the denoiser: of noisy latents, observed frames and control."""
         shown = self.backbone.shown_channels(self)
         return self.codec.channels + shown + self.control.channels(self)
 
@@ -63,7 +70,7 @@ class AssembledModel(World):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What the memory and the control can do."""
+        """The capabilities of the memory and the control."""
         memory = self.memory
         return Capabilities(
             memory=memory.REMEMBERS,
@@ -71,15 +78,17 @@ class AssembledModel(World):
             depth=self.clip.depth,
             cameras=not self.control.actions,
             points=memory.REMEMBERS,
-            edits=memory.EDITABLE,
-            coverage=memory.REMEMBERS and memory.READ_BY_BLOCKS,
+            edits=memory.EDITABLE and type(self).erase is not World.erase,
+            coverage=memory.REMEMBERS
+            and memory.READ_BY_BLOCKS
+            and type(self).coverage is not World.coverage,
             stage_without_memory=True,
             silent_actions=self.control.MODULATES,
         )
 
     @property
     def facts(self) -> Facts:
-        """What reports say of the parts."""
+        """Properties of the parts for reports."""
         memory = self.memory
         read = f", {memory.tokens} read per clip" if memory.READ_BY_BLOCKS else ""
         return Facts(
@@ -135,7 +144,7 @@ class AssembledModel(World):
         return self.memory.encoder.colours(values)
 
     def __post_init__(self):
-        """Validate what is in each section, and settings that depend on each other."""
+        """Validate each section, and settings that depend on each other."""
         require_section(self, "world", "model")
         for name, kind in (("clip", ClipConfig), ("actions", ActionConfig)):
             found = getattr(self, name)

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 from pewm_jax.config.training import DataConfig, EvalConfig, TrainConfig, TrainSettings
+from pewm_jax.config.world import World, require_capabilities
 from pewm_jax.errors import require
 from pewm_jax.registry import part, require_section
 
@@ -39,6 +40,8 @@ class Config:
             f"version is {self.version}: this library writes version {VERSION}; leave it out.",
         )
         require_section(self.model, "world", "model")
+        if isinstance(self.model, World):
+            require_capabilities(self.model)
         require(
             isinstance(self.train, self.model.TRAIN),
             f"train is a {type(self.train).__name__}, and a {type(self.model).__name__} is trained "

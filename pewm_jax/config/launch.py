@@ -1,4 +1,4 @@
-"""Flags of commands that are not settings: which processes join, and what a plan is for."""
+"""Flags of commands that are not settings: joining processes, and the target of a plan."""
 
 from __future__ import annotations
 

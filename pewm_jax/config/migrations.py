@@ -24,11 +24,11 @@ def upgrade(values: Values, where: str, under: Kinds | None = None) -> Values:
     Args:
         values: nested plain values, as read from JSON; they are not changed.
         where: name of the file, for error messages.
-        under: kinds of the settings that the values are laid over, which a section that does not
-            say its own is of; by default those that were the default in the values' version.
+        under: kinds of the settings that the values are laid over, for sections that do not state
+            their kind; by default the default kinds of the values' version.
 
     Raises:
-        ConfigError: the version is not a number, or newer than this library knows.
+        ConfigError: the version is not a number, or newer than this library supports.
     """
     version = values.get("version", VERSION if "model" in values else 1)
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:
@@ -49,9 +49,8 @@ def upgrade(values: Values, where: str, under: Kinds | None = None) -> Values:
 def from_1(values: Values, where: str, under: Kinds) -> Values:
     """Move the model's sections under ``model`` and split them into parts with kinds.
 
-    Version 1 held the settings of all kinds side by side, and used those of one: what is of the
-    others is dropped. A part that does not say its kind is of that which lies under, or of the one
-    that was the default, and is now.
+    Version 1 held the settings of all kinds side by side and used those of one; the others are
+    dropped. A part that does not state its kind has that of ``under``, or the default kind.
     """
     sections = ("clip", "actions", "codec", "dit", "memory", "diffusion", "train")
     _require_tables(values, where, *sections)
@@ -84,7 +83,7 @@ def from_1(values: Values, where: str, under: Kinds) -> Values:
 
 
 def from_2(values: Values, where: str, under: Kinds) -> Values:
-    """Call the reader that attends to points `attend`; there are others beside it now."""
+    """Rename the reader that attends to points to `attend`."""
     del where, under
     section: Any = values
     for name in ("model", "memory", "reader"):
@@ -107,7 +106,7 @@ def from_3(values: Values, where: str, under: Kinds) -> Values:
 
 
 def _rename_settings(values: Values) -> None:
-    """Rename settings that earlier files of the current version call otherwise, in place."""
+    """Rename settings that had other names in earlier files of the current version, in place."""
     model = values.get("model")
     if isinstance(model, dict):
         for old, new in RENAMED_SETTINGS.get(str(model.get("kind")), {}).items():
@@ -115,12 +114,12 @@ def _rename_settings(values: Values) -> None:
 
 
 def kind_now(section: str, name: Any) -> Any:
-    """Return the present name of a kind that earlier versions may have called otherwise."""
+    """Return the present name of a kind that may have had another name in earlier versions."""
     return RENAMED_KINDS.get((section, name), name) if isinstance(name, str) else name
 
 
 def _require_tables(values: Values, where: str, *names: str) -> None:
-    """Refuse anything but tables in sections whose settings move."""
+    """Refuse sections whose settings move and that are not tables."""
     for name in names:
         found = values.get(name, {})
         require(
@@ -130,7 +129,7 @@ def _require_tables(values: Values, where: str, *names: str) -> None:
 
 
 def _backbone(old: Values) -> Values:
-    """State what a table of learned positions did for other numbers of frames."""
+    """State the behaviour of a table of learned positions for other numbers of frames."""
     table = {"learned": "reference"} if old.get("positions") == "rope_learned" else {}
     return table | old
 

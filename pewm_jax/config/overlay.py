@@ -1,7 +1,7 @@
 """Lay settings over others: a JSON file over an experiment, or another kind over a section.
 
-A section that gets another kind keeps the settings that both kinds have. What is laid over is
-validated as a whole at the end, because later settings may be what makes earlier ones fit.
+A section that gets another kind keeps the settings that both kinds have. The result is validated as
+a whole at the end, because later settings may make earlier ones fit.
 """
 
 from __future__ import annotations
@@ -63,18 +63,13 @@ def _kinds_in(values: dict[str, Any], *path: str) -> Iterator[tuple[tuple[str, .
 
 
 def with_kind(default: T, path: Sequence[str], name: str) -> T:
-    """Put settings of another kind into a section, with what both kinds have in common.
+    """Replace a section by settings of another kind, with the settings that both kinds have.
 
-    Args:
-        default: the settings that the section is in.
-        path: of the section; where there is none that has kinds, nothing changes.
-        name: of the kind.
-
-    Returns:
-        Settings that are not validated: what follows may be what makes them fit each other.
+    The result is not validated, because later changes may make it fit. Nothing changes if there is
+    no section with kinds at the path.
 
     Raises:
-        ConfigError: there is no such kind, or one that cannot be made from defaults.
+        ConfigError: there is no such kind, or it cannot be created from defaults.
     """
     section = section_with_kinds(default, path)
     return default if section is None else _replaced(default, path, _as_kind(section, name))
@@ -123,7 +118,7 @@ def _replaced(settings: Any, path: Sequence[str], value: Any) -> Any:
 
 
 def _unchecked(settings: Any, changes: dict[str, Any]) -> Any:
-    """Return changed settings, not validated: the flags that follow may be what makes them fit."""
+    """Return changed settings without validation; later flags may make them fit."""
     new = object.__new__(type(settings))
     for field in dataclasses.fields(settings):
         value = changes.get(field.name, getattr(settings, field.name))

@@ -1,14 +1,15 @@
-"""The interfaces of a model's parts: what a backbone, a codec, a memory … must provide.
+"""The interfaces of a model's parts: backbone, codec, control, encoder, reader, memory, noise.
 
 A part is a frozen dataclass derived from one of these classes. Its fields are its settings, its
 methods are its functions: ``model.codec.encode(params, video)``. All methods are pure functions of
-their arguments. ``params`` are the part's own parameters, plain nested dictionaries, unless a
-method's documentation says otherwise. ``SHARDING`` lists rules ``(pattern, PartitionSpec)`` over
-the paths of the parameters in the world model, such as ``codec/encoder/kernel``; every parameter
-needs a rule. Letters of array axes are those of ``pewm_jax.types``.
+their arguments. ``model`` is the ``AssembledModel`` that the part belongs to; ``params`` are the
+part's own parameters, plain nested dictionaries, unless a method says otherwise. ``init`` returns
+random ones, {} if the part has none. ``SHARDING`` lists rules ``(pattern, PartitionSpec)`` over the
+paths of the parameters in the world model, such as ``codec/encoder/kernel``; every parameter needs
+a rule. Array axes have the letters of ``pewm_jax.types``.
 
-A class is registered by ``pewm_jax.registry.register``. This module imports no network and not JAX,
-so that reading settings stays fast.
+``pewm_jax.registry.register`` registers a class. This module imports no network and not JAX, so
+that reading settings stays fast.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ Rules: TypeAlias = tuple[Any, ...]
 
 @dataclasses.dataclass(frozen=True)
 class InjectionPoints:
-    """Where a memory reader runs in a backbone, and the sizes it needs to know.
+    """Where a memory reader runs in a backbone, and the sizes it needs.
 
     Attributes:
         count: how often it runs; its parameters are stacked along this axis.
@@ -59,10 +60,10 @@ class InjectionPoints:
 
 
 class Backbone(Settings):
-    """A denoiser: predicts from noisy latents what the noise asks for.
+    """A denoiser: predicts the noise's target from noisy latents.
 
     Attributes:
-        places: where a memory reader runs; None where none can.
+        places: the ``InjectionPoints`` of memory readers; None without any.
         time_dim: E, channels of the time embedding, to which a control may add.
         text_shape: (length, channels) of its text tokens; None if it takes none.
         stores_prompt: whether a prompt's embedding is stored with the weights.
@@ -84,7 +85,7 @@ class Backbone(Settings):
 
     @property
     def time_dim(self) -> int:
-        """Channels of the time embedding: those that the injection points state."""
+        """Channels of the time embedding, by default those of the injection points."""
         return self.places.time
 
     def init(self, key: Array, in_channels: int, out_channels: int) -> Params:
@@ -94,12 +95,12 @@ class Backbone(Settings):
     def apply(
         self, params: Params, x_BthwC: Array, time_B: Array, conditioning: Any, readers: Any
     ) -> Array:
-        """Predict from noisy latents what the noise asks for.
+        """Predict the noise's target from noisy latents.
 
         Args:
             params: its parameters.
             x_BthwC: (B, t, h, w, C) noisy latents; their dtype is the dtype of the computation.
-            time_B: (B,) noise level as the network sees it, or (B, t), one per latent frame.
+            time_B: (B,) noise level in the network's units, or (B, t), one per latent frame.
             conditioning: a ``models.interface.Conditioning``: further inputs.
             readers: a ``models.interface.Readers``: how the memory is read.
 
@@ -116,24 +117,18 @@ class Backbone(Settings):
     def observed(self, model: Any, params: Params, seen: Any) -> Any:
         """Return the ``Conditioning`` that holds the observed frames, or None for the default.
 
-        By default the latents are joined to the input, zero for the frames to be imagined.
-
-        Args:
-            model: the model.
-            params: the world model's parameters; those under ``image`` are from ``init_image``.
-            seen: a ``models.interface.Observed``: the observed frames.
+        By default their latents are joined to the input, zero for the frames to be imagined.
+        ``params`` are the world model's; those under ``image`` are from ``init_image``. ``seen`` is
+        a ``models.interface.Observed``.
         """
         del model, params, seen
 
     def shown_channels(self, model: Any) -> int:
-        """Return the number of input channels that show the observed frames: their latents'."""
+        """Return the number of input channels of the observed frames: those of their latents."""
         return model.codec.channels
 
     def check(self, model: Any) -> None:
-        """Refuse latents that do not split into the backbone's patches.
-
-        A backbone that takes other sizes has a check of its own.
-        """
+        """Refuse latents that do not split into the backbone's patches."""
         if self.places is None:
             return
         step = model.codec.spatial * self.places.patch
@@ -191,19 +186,17 @@ class Codec(Settings):
         return self.frames(clip.frames), clip.height // self.spatial, clip.width // self.spatial
 
     def init(self, key: Array) -> Params:
-        """Return random parameters; {} if it has none."""
+        """Return random parameters."""
         del key
         return {}
 
     def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
         """Encode a video.
 
-        Args:
-            params: its parameters.
-            video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3 where depth is encoded as
-                grey.
-            condition: whether the latents are what the denoiser is conditioned on. CogVideoX-1.5's
-                image-to-video model divides such latents by the scaling factor; others multiply.
+        Args: params: its parameters. video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3
+            where depth is encoded as grey. condition: whether the latents condition the denoiser.
+            CogVideoX-1.5's image-to-video model divides such latents by the scaling factor; others
+            multiply.
 
         Returns:
             (B, k + 1, H/s, W/s, C') latents.
@@ -214,30 +207,20 @@ class Codec(Settings):
         raise NotImplementedError
 
     def decode(self, params: Params, latents_BthwC: Array) -> Array:
-        """Decode latents, the inverse of ``encode``.
-
-        Args:
-            params: its parameters.
-            latents_BthwC: (B, k + 1, h, w, C') latents.
-
-        Returns:
-            (B, q·k + 1, h·s, w·s, C) video.
+        """Decode (B, k + 1, h, w, C') latents to a (B, q·k + 1, h·s, w·s, C) video.
 
         Raises:
-            UserError: latents that are decoded to another number of frames.
+            UserError: the number of latent frames cannot be decoded.
         """
         raise NotImplementedError
 
     def measured(self, depth_BTHW: Array) -> Array | None:
-        """Return the share of measured pixels per depth latent, or None for the default.
-
-        See ``codecs.rgbd.measured``.
-        """
+        """Return the share of measured pixels per depth latent, or None for the default."""
         del depth_BTHW
         return None
 
     def check(self, model: Any) -> None:
-        """Refuse clips that cannot be folded, and depth that is not encoded."""
+        """Refuse clips whose size cannot be encoded, and depth that is not encoded."""
         clip, q, s = model.clip, self.temporal, self.spatial
         require(
             (clip.frames - 1) % q == 0,
@@ -257,7 +240,7 @@ class Codec(Settings):
 
 
 class Conditioner(Settings):
-    """Turns what steers a clip (cameras, actions) into inputs of the denoiser.
+    """Turns the control of a clip (cameras, actions) into inputs of the denoiser.
 
     Attributes:
         MODULATES: whether it adds to the time embedding of each latent frame.
@@ -275,16 +258,12 @@ class Conditioner(Settings):
     rate: Any = 1.0
 
     def channels(self, model: Any) -> int:
-        """Return the number of channels, at the latent rate, that it adds to the denoiser's input.
-
-        Args:
-            model: the ``AssembledModel`` that it is part of.
-        """
+        """Return the channels, at the latent rate, that it adds to the denoiser's input."""
         del model
         return 0
 
     def init(self, model: Any, key: Array) -> Params:
-        """Return random parameters; {} if it has none."""
+        """Return random parameters."""
         del model, key
         return {}
 
@@ -296,9 +275,6 @@ class Conditioner(Settings):
             params: its parameters.
             observed: (B, 1) the observed first frames, colours in [−1, 1]; or more of them.
             control: (B, T) cameras, (B, T − 1) actions and (B, A) states if there are any.
-
-        Returns:
-            Input channels, modulation per latent frame, tokens: what the control provides.
         """
         raise NotImplementedError
 
@@ -310,8 +286,8 @@ class Encoder(Settings):
         channels: F, number of features of a patch.
         SHARDING: rules over ``encoder/…`` paths.
         CONVERTED: whether the weights are frozen and come from ``train.start``.
-        WEIGHTS: the part of the model whose parameters it takes: its own, or the ``codec``'s. One
-            that takes another part's parameters has ``features`` of its own and no ``encode``.
+        WEIGHTS: the part of the model whose parameters it uses: its own, or the ``codec``'s. An
+            encoder of the second kind overrides ``features`` and has no ``encode``.
     """
 
     SECTION: ClassVar[str] = "encoder"
@@ -321,44 +297,32 @@ class Encoder(Settings):
     channels: Any
 
     def grid(self, clip: Any) -> tuple[int, int]:
-        """Return the rows and columns of patches that a frame of a ``ClipConfig`` has."""
+        """Return the rows and columns of patches of a ``ClipConfig``'s frame."""
         raise NotImplementedError
 
     def init(self, key: Array) -> Params:
-        """Return random parameters; {} if it has none."""
+        """Return random parameters."""
         del key
         return {}
 
     def encode(self, params: Params, rgb_THWC: Array) -> Array:
-        """Return patch features (T, h, w, F); the memory resizes them itself.
-
-        Args:
-            params: its parameters.
-            rgb_THWC: (T, H, W, 3) float in [−1, 1].
-        """
+        """Return (T, h, w, F) patch features of (T, H, W, 3) colours in [−1, 1]."""
         raise NotImplementedError
 
     def features(self, model: Any, params: Params, rgb_THWC: Array) -> Array:
-        """Return the features (T, h, w, F) that a model's memory keeps of frames.
+        """Return the features (T, h, w, F) that the model's memory keeps of (T, H, W, 3) colours.
 
-        Args:
-            model: the model.
-            params: the world model's parameters.
-            rgb_THWC: (T, H, W, 3) float in [−1, 1].
+        ``params`` are the world model's.
         """
         del model
         return self.encode(params.get("encoder", {}), rgb_THWC)
 
     def weights(self, params: Params) -> Params:
-        """Return those of the world model's parameters that ``features`` uses; {} if none."""
+        """Return those of the world model's parameters that ``features`` uses."""
         return {self.WEIGHTS: params[self.WEIGHTS]} if self.WEIGHTS in params else {}
 
     def require_own(self, what: str) -> None:
-        """Refuse an encoder that takes another part's parameters.
-
-        Raises:
-            UserError: it does; ``what`` completes the sentence "its features …".
-        """
+        """Refuse an encoder with another part's parameters, because its features ``what``."""
         if self.WEIGHTS != "encoder":
             raise UserError(
                 f"memory.encoder takes the weights of the {self.WEIGHTS}: its features {what}; "
@@ -370,10 +334,7 @@ class Encoder(Settings):
         raise NotImplementedError
 
     def colours(self, features_VF: np.ndarray) -> np.ndarray:
-        """Return (V, 3) colours in [−1, 1] in which features are drawn.
-
-        By default they are the first three principal components of the features.
-        """
+        """Return (V, 3) colours in [−1, 1] to draw features in: their principal components."""
         import numpy as np  # noqa: PLC0415 - reading settings does not need it
 
         values = np.asarray(features_VF, np.float32)
@@ -388,10 +349,10 @@ class Reader(Settings):
 
     Attributes:
         SHARDING: rules over ``memory/…`` paths.
-        READS_TOKENS: whether it takes the points that a clip's cameras see, ``tokens`` of a
-            ``MemoryReadout``.
-        READS_VIEW: whether it takes the memory rendered for them, its ``view``.
-        READS_LATENTS: whether it takes that encoded by the codec instead, its ``encoded``.
+        READS_TOKENS: whether it takes ``tokens`` of a ``MemoryReadout``: the points that a clip's
+            cameras see.
+        READS_VIEW: whether it takes ``view``: the memory rendered for them.
+        READS_LATENTS: whether it takes ``encoded`` instead: the rendering as latents of the codec.
         split_heads: a number that ``train.mesh.tensor`` must divide.
     """
 
@@ -403,52 +364,40 @@ class Reader(Settings):
     split_heads: Any = 1
 
     def init(self, model: Any, key: Array) -> Params:
-        """Return random parameters, initialized so that the reader has no effect yet."""
+        """Return random parameters with which the reader has no effect yet."""
         raise NotImplementedError
 
     def prepare(
         self, model: Any, params: Params, readout: MemoryReadout, camera: Camera, rays_BthwC: Array
     ) -> Any:
-        """Prepare to read the memories of a batch of clips.
+        """Return the ``models.interface.Readers`` that the backbone calls for a batch of clips.
 
-        Args:
-            model: the model.
-            params: its parameters.
-            readout: what the memory shows each clip, leading axis B; it has what the class
-                attributes ask for.
-            camera: (B, T) cameras of the clips.
-            rays_BthwC: their Plücker rays at the latent rate (``controls.camera.rays``).
-
-        Returns:
-            The ``models.interface.Readers`` that the backbone calls.
+        Args: model: the model. params: its parameters. readout: the memory's readout of each clip,
+            leading axis B, with the parts that the class attributes name. camera: (B, T) cameras of
+            the clips. rays_BthwC: their Plücker rays at the latent rate (``controls.camera.rays``).
         """
         raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)
 class Memory(Settings):
-    """What a world remembers, as which features, and how it is read.
+    """The content of a world's memory, its features, and its reader.
 
-    A memory's state is a pytree of static size, of the type that ``empty`` returns. The methods are
-    pure and handle one world: jit and vmap them.
+    The state of a memory is a pytree of static size, of the type that ``empty`` returns. The
+    methods are pure and handle one world: jit and vmap them.
 
-    Attributes:
-        KEEPS_FEATURES: whether it keeps features of the image encoder.
-        REMEMBERS: whether it ever holds anything.
-        READ_BY_BLOCKS: whether memory blocks read it, which are trained for that; else it is the
-            state of its world.
+    Attributes: KEEPS_FEATURES: whether it keeps features of the image encoder; else the first three
+        features of a point are its colour. REMEMBERS: whether it ever holds anything.
+        READ_BY_BLOCKS: whether trained memory blocks read it; else it is the state of its world.
         CLASSES: whether it holds class ids of recorded voxels (``kinds``, ``colours``,
-            ``pictures``).
-        EDITABLE: whether boxes of it can be erased and moved.
-        GRID_TOLERANCE: how many cells beside its own a point may stand for in coverage.
+        ``pictures``). EDITABLE: whether ``erase`` and ``move`` work. GRID_TOLERANCE: the distance,
+        in cells, within which a point counts as held in coverage.
     """
 
     SECTION: ClassVar[str] = "memory"
     SHARDING: ClassVar[Rules] = ()
     KEEPS_FEATURES: ClassVar[bool] = True
-    """Whether it keeps the encoder's features; else the first three of a point are its colour."""
     REMEMBERS: ClassVar[bool] = True
-    """Whether it ever holds anything."""
     READ_BY_BLOCKS: ClassVar[bool] = True
     CLASSES: ClassVar[bool] = False
     EDITABLE: ClassVar[bool] = False
@@ -483,26 +432,21 @@ class Memory(Settings):
 
     @property
     def room(self) -> int:
-        """How many points it can hold."""
+        """The number of points it can hold."""
         return self.capacity
 
     @property
     def rendered_channels(self) -> int:
-        """Channels of the memory's pictures: the colour, or the features that are kept."""
+        """Channels of the rendered memory: the colour, or the features that are kept."""
         return self.encoder.channels if self.KEEPS_FEATURES else 3
 
     @property
     def grid(self) -> Memory:
-        """The settings whose cells its points stand for."""
+        """The settings of the grid of its points."""
         return self
 
     def empty(self, model: Any, centre_3: Array) -> Any:
-        """Return an empty memory.
-
-        Args:
-            model: the model.
-            centre_3: (3,) world position that the memory is centred on, metres.
-        """
+        """Return an empty memory centred on a world position (3,), metres."""
         raise NotImplementedError
 
     def insert(
@@ -520,8 +464,7 @@ class Memory(Settings):
 
         Args:
             model: the model.
-            params: the world model's parameters, for a memory whose update is learned; others
-                ignore them.
+            params: the world model's parameters, for memories whose update is learned.
             memory: from ``empty`` or from an earlier call.
             frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
             features_ThwF: (T, h, w, F) their patch features (``Encoder.features``).
@@ -531,13 +474,7 @@ class Memory(Settings):
         raise NotImplementedError
 
     def read(self, model: Any, memory: Any, camera: Camera) -> MapTokens:
-        """Return the M = ``tokens`` tokens that condition one clip.
-
-        Args:
-            model: the model.
-            memory: what is remembered.
-            camera: (T,) cameras of the clip.
-        """
+        """Return the M = ``tokens`` tokens that condition one clip of (T,) cameras."""
         raise NotImplementedError
 
     def to_points(self, model: Any, memory: Any) -> tuple[Array, Array, Array]:
@@ -557,13 +494,10 @@ class Memory(Settings):
     def erase(self, model: Any, memory: Any, box_23: Array) -> Any:
         """Erase the content of a box, as if it had never been observed.
 
-        Args:
-            model: the model.
-            memory: its state.
-            box_23: (2, 3) lower and upper corner in the world, metres; upper faces are outside.
+        ``box_23`` is the lower and upper corner in the world, metres; upper faces are outside.
 
         Raises:
-            UserError: the box is not a box, or this memory cannot be edited.
+            UserError: the box is invalid, or this memory cannot be edited.
         """
         del model, memory, box_23
         raise self._not_editable()
@@ -571,14 +505,9 @@ class Memory(Settings):
     def move(
         self, model: Any, memory: Any, box_23: Array, transform: Array, *, leave: bool = False
     ) -> Any:
-        """Move the content of a box.
+        """Move the content of a box by a rigid (4, 4) transform from old to new positions, metres.
 
-        Args:
-            model: the model.
-            memory: its state.
-            box_23: as for ``erase``.
-            transform: (4, 4) rigid, from old to new positions, metres.
-            leave: keep the content of the box in place, too: a copy.
+        With ``leave`` the content also stays in place: a copy.
 
         Raises:
             UserError: as for ``erase``, or the transform is not a rigid 4×4.
@@ -593,7 +522,7 @@ class Memory(Settings):
         )
 
     def trimmed(self, memory: Any) -> Any:
-        """Return a memory to look at and not to add to: smaller if it can be; not under jit."""
+        """Return the memory for reading only, smaller if it can be; not under jit."""
         return memory
 
     def check(self, model: Any) -> None:
@@ -674,7 +603,7 @@ class Noise(Settings):
 
     @staticmethod
     def expand(time_B: Array, ndim: int) -> Array:
-        """Give times (B,) or (B, t) trailing axes, so that they broadcast with (B, t, …)."""
+        """Append axes to times (B,) or (B, t), so that they broadcast with (B, t, …)."""
         return time_B.reshape(*time_B.shape, *(1,) * (ndim - time_B.ndim))
 
     def draw(self, key: Array, batch: int, frames: int) -> Array:

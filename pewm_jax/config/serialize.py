@@ -88,7 +88,7 @@ def _has_kinds(hint: Any) -> bool:
 
 
 def _named(base: type, values: dict[str, Any], where: str) -> type:
-    """Return the settings' type that a table asks for by its ``kind``."""
+    """Return the settings' class that a table names by its ``kind``."""
     section = base.SECTION  # type: ignore[attr-defined]
     if "kind" not in values:
         return base if dataclasses.is_dataclass(base) else kinds.named(section, "").settings
@@ -120,13 +120,7 @@ def _coerce(hint: Any, value: Any, where: str) -> Any:
 
 
 def accepts(kind: type, name: str, value: Any) -> bool:
-    """Tell whether a setting of a kind can have a value, by its type alone.
-
-    Args:
-        kind: the dataclass of settings.
-        name: of the field.
-        value: for it, plain or a dataclass.
-    """
+    """Tell whether a setting of a kind can have a plain value or a dataclass, by its type."""
     hint = typing.get_type_hints(kind)[name]
     if hint is Any:
         return True

@@ -3,10 +3,51 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, Literal
 
-from pewm_jax.config.mesh import MeshConfig
-from pewm_jax.errors import is_pattern, require
+from pewm_jax.errors import ConfigError, is_pattern, require, require_fields, require_positive
+
+AXES = ("data", "fsdp", "tensor", "context")
+"""The mesh axes, outermost first; devices along the last ones communicate most."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshConfig:
+    """The number of devices along each mesh axis; their product is the number of devices."""
+
+    data: int = 0
+    """Copies of the weights, each with its part of the batch (data parallelism); 0 uses all devices
+    that the other axes leave."""
+    fsdp: int = 1
+    """Parts that the weights and the batch are split into (fully sharded data parallelism)."""
+    tensor: int = 1
+    """Parts that heads and feed-forward channels are split into."""
+    context: int = 1
+    """Parts that a clip's video tokens are split into."""
+
+    def __post_init__(self):
+        """Validate."""
+        for name in AXES:
+            least = 0 if name == "data" else 1
+            value = getattr(self, name)
+            require(value >= least, f"train.mesh.{name} is {value}: use {least} or more.")
+
+    def shape(self, devices: int) -> tuple[int, int, int, int]:
+        """Return the sizes along ``AXES`` for a number of devices.
+
+        Raises:
+            ConfigError: the sizes do not multiply to the number of devices.
+        """
+        rest = math.prod((self.fsdp, self.tensor, self.context))
+        data = self.data or max(devices // rest, 1)
+        if data * rest != devices:
+            raise ConfigError(
+                f"train.mesh asks for data {self.data or 'the rest'} × fsdp {self.fsdp} × tensor "
+                f"{self.tensor} × context {self.context} and there are {devices} devices: choose "
+                "axes whose product is that number."
+            )
+        return data, self.fsdp, self.tensor, self.context
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,10 +85,9 @@ class DataConfig:
             f"data.stride_min {self.stride_min} and data.stride_max {self.stride_max}: need "
             "1 ≤ min ≤ max.",
         )
-        require(self.context >= 1, "data.context must be at least 1 frame.")
-        require(self.prepared >= 0, f"data.prepared is {self.prepared}: use 0 or more clips.")
-        require(self.workers >= 0, f"data.workers is {self.workers}: use 0 or more threads.")
-        require(self.bad_records >= 0, f"data.bad_records is {self.bad_records}: use 0 or more.")
+        require_positive(self, "data", "context")
+        counts = ("prepared", "workers", "bad_records")
+        require_fields(self, "data", lambda value: value >= 0, "0 or more", *counts)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,43 +185,20 @@ class TrainSettings:
 
     def __post_init__(self):
         """Validate."""
-        require(0 <= self.ema < 1, f"train.ema is {self.ema}: use a decay in [0, 1).")
-        for name in ("beta1", "beta2"):
-            value = getattr(self, name)
-            require(0 <= value < 1, f"train.{name} is {value}: use a decay in [0, 1).")
-        require(self.epsilon > 0, f"train.epsilon is {self.epsilon}: use a number above 0.")
-        require(self.clip_norm > 0, "train.clip_norm must be above 0.")
-        require(
-            min(self.save_every, self.log_every, self.keep) >= 1,
-            "train.save_every, train.log_every and train.keep must be at least 1.",
-        )
-        require(self.keep_every >= 0, f"train.keep_every is {self.keep_every}: use 0 or more.")
-        require(self.grace_s > 0, f"train.grace_s is {self.grace_s}: use more than 0 seconds.")
-        require(
-            self.image_noise_std >= 0,
-            f"train.image_noise_std is {self.image_noise_std}: use 0 or more.",
-        )
-        require(
-            0 <= self.depth_noise < 1,
-            f"train.depth_noise is {self.depth_noise}: use a share of the depth in [0, 1).",
-        )
-        require(
-            0 <= self.hidden <= 1, f"train.hidden is {self.hidden}: use a share of clips in [0, 1]."
-        )
-        require(
-            0 <= self.chained <= 1,
-            f"train.chained is {self.chained}: use a share of clips in [0, 1].",
-        )
+        for accepts, hint, *names in (
+            (lambda x: 0 <= x < 1, "a decay in [0, 1)", "ema", "beta1", "beta2"),
+            (lambda x: x > 0, "a number above 0", "epsilon", "clip_norm"),
+            (lambda x: x >= 1, "at least 1", "save_every", "log_every", "keep"),
+            (lambda x: x >= 0, "0 or more", "keep_every", "image_noise_std", "weight_decay"),
+            (lambda x: x >= 0, "0 or a positive number", "seed"),
+            (lambda x: x >= 0, "0 (no pictures) or more steps", "preview_every"),
+            (lambda x: x > 0, "more than 0 seconds", "grace_s"),
+            (lambda x: 0 <= x < 1, "a share of the depth in [0, 1)", "depth_noise"),
+            (lambda x: 0 <= x <= 1, "a share of clips in [0, 1]", "hidden", "chained"),
+        ):
+            require_fields(self, "train", accepts, hint, *names)
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")
-        require(self.seed >= 0, f"train.seed is {self.seed}: use 0 or a positive number.")
-        require(
-            self.weight_decay >= 0, f"train.weight_decay is {self.weight_decay}: use 0 or more."
-        )
-        require(
-            self.preview_every >= 0,
-            f"train.preview_every is {self.preview_every}: use 0 (no pictures) or more steps.",
-        )
 
     def require_fit(self, model: Any) -> None:
         """Refuse settings that do not go together with the world's."""
@@ -271,11 +288,8 @@ class EvalConfig:
             len(set(self.seeds)) == len(self.seeds),
             "evaluate.seeds has one of them twice: the same noise would count twice.",
         )
-        require(
-            min(self.clips, self.chain, self.stride, self.videos, self.video_clips, self.batch)
-            >= 1,
-            "evaluate.clips, chain, stride, videos, video_clips and batch must be at least 1.",
-        )
+        counts = ("clips", "chain", "stride", "videos", "video_clips", "batch")
+        require_positive(self, "evaluate", *counts)
         require(
             self.mirror >= -1,
             f"evaluate.mirror is {self.mirror}: use a number of frames such as 32, 0 to leave the "

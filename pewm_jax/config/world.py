@@ -1,10 +1,10 @@
-"""Tasks and worlds: what training needs to know of a model, and what a world can do.
+"""Tasks and worlds: their settings, stages and capabilities, and the shape of a clip.
 
-A ``Task`` is what ``pewm-jax train`` trains: it has parameters, stages and a ``batch_spec`` that
-names the recorded arrays its loss needs. A ``World`` is a task that also imagines frames. What
-a world can do beyond that stands in its ``capabilities``. Everything outside a world's own package
-(loader, training, evaluation, planning, viewer, export) asks the capabilities and the batch
-specification, never the class.
+A ``Task`` is trained by ``pewm-jax train``: it has parameters, stages and a ``batch_spec`` that
+names the recorded arrays its loss needs. A ``World`` is a task that also imagines frames; its
+``capabilities`` say what else it can do. Code outside a world's own package (loader, training,
+evaluation, planning, viewer, export) uses the capabilities and the batch specification, never the
+class.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from __future__ import annotations
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pewm_jax.config.clip import ActionConfig, ClipConfig
 from pewm_jax.config.training import TrainSettings
+from pewm_jax.errors import require
 from pewm_jax.registry import Settings
 
 if TYPE_CHECKING:
@@ -23,6 +23,66 @@ if TYPE_CHECKING:
 
 PLANAR = 3
 """Numbers of a planar action: metres forward, metres left, radians to the left."""
+SMALLEST = 12
+"""Smallest side of a clip in pixels: the evaluation's SSIM slides a window of 11 over the image."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ClipConfig:
+    """The shape of a clip: the frames that are imagined at once."""
+
+    frames: int = 9
+    """Frames of a clip: the first is observed, the rest are generated. The codec folds them in
+    time: with `codec.temporal` 4, use 4k + 1 frames."""
+    height: int = 64
+    """Image height in pixels."""
+    width: int = 64
+    """Image width in pixels."""
+    near_m: float = 0.1
+    """Depth that maps to −1, metres; nearer depths are clipped."""
+    far_m: float = 12.0
+    """Depth that maps to +1, metres; farther depths are clipped."""
+    depth_scale: Literal["linear", "log"] = "log"
+    """How metres map to [−1, 1] between near and far."""
+    depth: bool = True
+    """Whether the denoiser generates depth; without it only observed frames can be remembered."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(
+            self.frames >= 2,
+            f"clip.frames is {self.frames}: a clip has an observed frame and at least one to be "
+            "imagined; use 9.",
+        )
+        require(
+            0 < self.near_m < self.far_m,
+            f"clip.near_m {self.near_m} and clip.far_m {self.far_m}: near must be above 0 and "
+            "below far.",
+        )
+        require(
+            min(self.height, self.width) >= SMALLEST,
+            f"clip.height {self.height} and clip.width {self.width} must be at least {SMALLEST} "
+            "pixels: the structural similarity of the evaluation looks through a window of 11; "
+            "use 16 or more.",
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionConfig:
+    """What one discrete action does to the agent."""
+
+    step_m: float = 0.25
+    """Length of one forward step, metres."""
+    turn_deg: float = 30.0
+    """Angle of one turn, degrees."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(self.step_m > 0, f"actions.step_m is {self.step_m}: it must be above 0 metres.")
+        require(
+            0 < self.turn_deg <= 180,
+            f"actions.turn_deg is {self.turn_deg}: use an angle above 0 and up to 180 degrees.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +101,8 @@ class BatchSpec:
         context: whether earlier frames of the episode are read, from which a memory is built.
         actions: numbers of an action that the loss needs; 0 if it needs none. Recorded actions are
             in the batch either way.
-        extras: further recorded arrays by their names in ``types.Clip.extras``. The loader knows
-            ``classes_TXYZ`` and ``origin_T3``; data without them give batches without them.
+        extras: further recorded arrays by their names in ``types.Clip.extras``. The loader supports
+            ``classes_TXYZ`` and ``origin_T3``; they are absent if the data do not have them.
         features: cached image features of one context frame, where ``data.features`` names a cache;
             None if the loss uses none.
     """
@@ -62,8 +122,8 @@ class BatchSpec:
 class Capabilities:
     """What a world can do.
 
-    A command that needs a capability which a world lacks leaves that part out and says so, or
-    refuses if nothing would remain.
+    A command that needs a missing capability reports and omits that part, or refuses the world if
+    nothing would remain.
 
     Attributes:
         memory: whether a state holds more than the present frame, so that ``imagine`` with
@@ -74,12 +134,12 @@ class Capabilities:
         actions: whether planar actions (dx, dy, dyaw) steer it.
         cameras: whether cameras without actions steer it.
         points: whether ``memory_points`` lists the memory as coloured points.
-        edits: whether ``erase`` and ``move`` change what is in a box of the memory.
-        coverage: whether ``coverage`` tells which pixels the memory shows.
+        edits: whether ``erase`` and ``move`` change the content of a box of the memory.
+        coverage: whether ``coverage`` counts the pixels that the memory covers.
         stage_without_memory: whether a stage trains without the memory, so that a run without a
             memory can be compared.
-        silent_actions: whether actions act through the parameters ``control``, which set to zero
-            give a model that no action steers.
+        silent_actions: whether actions act through the parameters ``control``, so that a model
+            whose ``control`` is zero ignores actions.
     """
 
     memory: bool = False
@@ -94,17 +154,39 @@ class Capabilities:
     silent_actions: bool = False
 
 
+METHODS = {"edits": ("erase", "move"), "points": ("memory_points",), "coverage": ("coverage",)}
+"""Capability → the methods of ``World`` that a world with it must override."""
+
+
+def require_capabilities(world: World) -> None:
+    """Refuse a world whose capabilities are of another type, or name methods that it lacks."""
+    found, name = world.capabilities, type(world).__name__
+    require(
+        isinstance(found, Capabilities),
+        f"{name}.capabilities is a {type(found).__name__}: make it a property that returns "
+        "pewm_jax.config.Capabilities(…).",
+    )
+    for capability, methods in METHODS.items():
+        declared = getattr(found, capability)
+        missing = [m for m in methods if declared and getattr(type(world), m) is getattr(World, m)]
+        require(
+            not missing,
+            f"{name}.capabilities has {capability}=True, and {name} has no method "
+            f"{' and '.join(missing)}: add it, or set {capability}=False.",
+        )
+
+
 @dataclasses.dataclass(frozen=True)
 class Facts:
-    """What reports and model cards say of a task; empty text is left out.
+    """Properties of a task for reports and model cards; empty text is left out.
 
     Attributes:
         memory: the kind of the memory.
-        encoder: the kind of the image features that it keeps.
+        encoder: the kind of its image features.
         reader: how the network reads it.
-        positions: how the reader knows where its points are.
+        positions: the encoding of its points' positions.
         capacity: the size of the memory, in words.
-        room: how many points the memory can hold; 0 if there is no such number.
+        room: the number of points the memory can hold; 0 if there is no such number.
         cell_m: size of the memory's cells in metres, to draw it; empty if it has none.
         codec: the kind of the codec.
         control: the kind of the control.
@@ -128,17 +210,17 @@ class Facts:
 
 
 class Task(Settings):
-    """Base class of what is trained: its settings and its methods.
+    """Base class of trained models: their settings and methods.
 
     Attributes:
         TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
             for each of the task's stages, named as the stage.
         TRAINS: parts that other tasks take from ``train.start`` and this one trains itself.
-        INSTEAD: what a run of a task that imagines nothing did, and what to do with it, for error
-            messages: "trained a codec alone, which imagines nothing: …".
+        INSTEAD: for error messages about a task that imagines nothing: what its run did, and what
+            to do with it: "trained a codec alone, which imagines nothing: …".
         EXPORTED: whether ``export inference`` writes it with 16-bit weights.
-        CARD: what its model card says of what it is and of its use, for tasks that are no world;
-            ``{version}`` and ``{name}`` are filled in.
+        CARD: description and use in the model card of a task that is not a world; ``{version}`` and
+            ``{name}`` are filled in.
         clip: the shape of the clips that the loader reads.
         dtype: precision of computation and of frozen weights.
     """
@@ -154,12 +236,12 @@ class Task(Settings):
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """Which recorded arrays the losses need."""
+        """The recorded arrays that the losses need."""
         return BatchSpec()
 
     @property
     def facts(self) -> Facts:
-        """What reports and model cards say of it."""
+        """Properties for reports and model cards."""
         return Facts()
 
     @abc.abstractmethod
@@ -190,9 +272,9 @@ class Task(Settings):
 class World(Task):
     """Base class of a world.
 
-    A world overrides ``observe`` and ``imagine`` and the methods that its capabilities name. The
-    methods are pure functions of arrays. ``pewm_jax.worlds`` has a function for each, which checks
-    the arguments and compiles ``start``, ``observe``, ``imagine`` and ``imagine_many`` by
+    A world overrides ``observe`` and ``imagine`` and the methods of its capabilities (``METHODS``).
+    The methods are pure functions of arrays. ``pewm_jax.worlds`` has a function for each, which
+    checks the arguments and compiles ``start``, ``observe``, ``imagine`` and ``imagine_many`` by
     ``jax.jit`` with the settings static.
 
     Attributes:
@@ -216,18 +298,13 @@ class World(Task):
         """Return the same world with another number of the sampler's steps.
 
         Raises:
-            ConfigError: the sampler cannot take so many.
+            ConfigError: the sampler does not support that number.
         """
         del steps
         return self
 
     def start(self, params: Params, frames: Frames) -> WorldState:
-        """Begin a world; by default, observe from a state whose memory is None.
-
-        Args:
-            params: the parameters.
-            frames: S ≥ 1 frames (S, H, W, …), as for ``observe``; the last one is the present.
-        """
+        """Begin a world from S ≥ 1 frames; by default, ``observe`` them without a memory."""
         from pewm_jax.types import WorldState  # noqa: PLC0415 - reading settings needs no JAX
 
         return self.observe(params, WorldState(frames, None), frames)
@@ -287,7 +364,7 @@ class World(Task):
         """Imagine K candidates from one state; by default, vmap ``imagine``.
 
         ``pewm_jax.worlds.imagine_many`` documents arguments and result. A world whose ``views``
-        returns a function takes its result as the further argument ``views``.
+        returns a function also takes ``views``, the result of that function.
         """
         import jax  # noqa: PLC0415 - reading settings does not need it
 
@@ -313,12 +390,11 @@ class World(Task):
         del params, state
 
     def memory_points(self, memory: Any) -> tuple[Array, Array, Array, Array | None]:
-        """Return the memory as points, where ``capabilities.points`` says so.
+        """Return the memory as points, for the capability ``points``.
 
-        Returns:
-            ``(points_V3, features_VF, valid_V, observed_V)``: positions in metres; features, which
-            ``point_colours`` turns into colours; which of the V slots are used; and which points
-            were observed, not imagined, or None if the memory does not tell.
+        Returns: ``(points_V3, features_VF, valid_V, observed_V)``: positions in metres; features,
+            which ``point_colours`` turns into colours; which of the V slots are used; and which
+            points were observed, not imagined, or None if the memory does not distinguish them.
         """
         raise NotImplementedError(f"{type(self).__name__} lists no points.")
 
@@ -327,15 +403,10 @@ class World(Task):
         return features_VF[..., :3]
 
     def erase(self, params: Params, state: WorldState, box_23: Array) -> WorldState:
-        """Forget what is in a box, where ``capabilities.edits`` says so.
+        """Erase the content of a box, for the capability ``edits``.
 
-        Args:
-            params: the parameters.
-            state: the world so far.
-            box_23: lower and upper corner in the world, metres.
-
-        Returns:
-            The changed memory, and a present frame that shows the change.
+        ``box_23`` is the lower and upper corner in the world, metres. The memory changes, and so
+        does the present frame.
         """
         raise NotImplementedError(f"{type(self).__name__} cannot be edited.")
 
@@ -348,13 +419,13 @@ class World(Task):
         *,
         leave: bool = False,
     ) -> WorldState:
-        """Move what is in a box by a rigid 4×4 transform; ``leave`` copies it."""
+        """Move the content of a box by a rigid 4×4 transform; ``leave`` copies it."""
         raise NotImplementedError(f"{type(self).__name__} cannot be edited.")
 
     def coverage(
         self, params: Params, state: WorldState, frames: Frames, seen_THW: Array
     ) -> dict[str, Array]:
-        """Count the pixels that the memory covers, where ``capabilities.coverage`` says so.
+        """Count the pixels that the memory covers, for the capability ``coverage``.
 
         Args:
             params: the parameters.

@@ -1,12 +1,12 @@
 """Control by actions, added to the time embedding of each latent frame (EgoWM, arXiv 2601.15284).
 
 Wherever the noise level modulates a network, frame i gets proj(e_t + e_a[i]), or, with the agent's
-state, proj(e_t + e_s + e_a[i]) (Eqs. 5 and 6): no layer of the network changes. e_a[i] is made of
-the actions that lead to the frames of latent frame i, and with convolutions of earlier ones, never
-of later ones. Observed frames have none. The last layers are zero at first, so that a model that
-was trained without actions gives what it gave.
+state, proj(e_t + e_s + e_a[i]) (Eqs. 5 and 6): no layer of the network changes. e_a[i] depends on
+the actions that lead to the frames of latent frame i, and with convolutions on earlier actions,
+never on later ones. Observed frames have none. The last layers are zero at first, so that a model
+trained without actions is unchanged.
 
-The paper does not say which frequencies its sinusoids have: here they are geometric (``SLOWEST`` to
+The paper does not state the frequencies of its sinusoids: here they are geometric (``SLOWEST`` to
 ``FASTEST``) for numbers from −1 to 1.
 """
 
@@ -121,10 +121,10 @@ class ModulationConfig(Conditioner):
     def condition(
         self, model: Any, params: Params, observed: Frames, control: Control
     ) -> Conditioning:
-        """Return the actions as modulation, and rays if asked for.
+        """Return the actions as modulation, and rays if ``rays`` is set.
 
         Raises:
-            UserError: there are no actions, or no state and the settings ask for it.
+            UserError: there are no actions, or no state although the settings need it.
         """
         if control.actions_TA is None:
             raise UserError(

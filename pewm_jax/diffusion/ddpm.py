@@ -1,26 +1,51 @@
 """DDPM: discrete noise levels ᾱ, as in CogVideoX.
 
 The schedule is CogVideoX's: scaled-linear betas, an optional SNR shift, rescaled to zero terminal
-SNR (Lin et al. 2023, arXiv 2305.08891, Alg. 1). It is computed in float64.
+SNR (Lin et al. 2023, arXiv 2305.08891, Alg. 1). DDIM and SDE-DPM-Solver++ (2M) share one update::
+
+    x ← keep · x + add · ((1 + mix) · x0 − mix · x0 of the step before) + spread · fresh noise
+
+Schedule and coefficients depend on the noise levels only. They are computed in float64 before
+tracing, so that levels without signal or without noise, whose log-SNR is infinite, need no special
+case under ``lax.scan``. References: ``scheduling_ddim_cogvideox.py`` and
+``scheduling_dpm_cogvideox.py`` in ``diffusers/schedulers/``.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config.parts import Noise
-from pewm_jax.diffusion import sampler
+from pewm_jax.config.parts import Denoiser, Noise
 from pewm_jax.errors import require
 from pewm_jax.types import Array
 
-Denoiser: TypeAlias = Callable[[Array, Array], Array]
-"""``(x_t, levels_B) -> x0``; ``DDPMConfig.to_x0`` converts predictions of v or ε."""
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """The coefficients of every sampling step, or of one.
+
+    Attributes:
+        timestep: (steps,) int32 noise level given to the denoiser.
+        keep: (steps,) weight of the present sample.
+        add: (steps,) weight of the clean sample.
+        mix: (steps,) extrapolation of the clean sample from the step before.
+        spread: (steps,) weight of fresh noise.
+        guidance: (steps,) weight of guidance.
+    """
+
+    timestep: Array
+    keep: Array
+    add: Array
+    mix: Array
+    spread: Array
+    guidance: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,8 +161,8 @@ class DDPMConfig(Noise):
     def levels(self) -> np.ndarray:
         """Return (sample_steps,) int32 visited levels, descending (Lin et al. 2023, Table 2).
 
-        Trailing spacing begins at the last training level. The result always has ``sample_steps``
-        levels. (In the reference, rounding adds a further level, −1, for 62 of 1000 counts.)
+        Trailing spacing begins at the last training level. (In the reference, rounding adds a
+        further level, −1, for 62 of 1000 counts.)
         """
         count, total = self.sample_steps, self.train_steps
         if self.spacing == "linspace":
@@ -150,46 +175,6 @@ class DDPMConfig(Noise):
 
     def sample(
         self,
-        denoise: Callable[[Array, Array, Array], Array],
-        noise: Array,
-        key: Array | None = None,
-    ) -> Array:
-        """Sample with the configured sampler.
-
-        Args:
-            denoise: ``(x_t, levels_B, weight) -> x0``; the last is the weight of guidance (see
-                ``guidance_weights``).
-            noise: (B, …) standard normal start.
-            key: randomness of the steps; only the sampler dpm needs it.
-
-        Returns:
-            (B, …) the sample.
-
-        Raises:
-            ValueError: the sampler is dpm and there is no key.
-        """
-        if self.sampler == "ddim":
-            return sampler.follow(self.steps(), denoise, noise)
-        if key is None:
-            raise ValueError("noise.sampler dpm draws fresh noise at every step: give it a key.")
-        return sampler.follow(self.steps(), denoise, noise, _draw(key, noise))
-
-    def ddim(self, denoise: Denoiser, noise: Array, *, every_step: bool = False) -> Array:
-        """Sample by DDIM (Song et al. 2021, η = 0; ``CogVideoXDDIMScheduler``).
-
-        Args:
-            denoise: ``(x_t, levels_B) -> x0``.
-            noise: (B, …) standard normal start.
-            every_step: return the sample after every step, (sample_steps, B, …).
-
-        Returns:
-            (B, …) the sample, whatever the ``sampler`` setting says.
-        """
-        rows = dataclasses.replace(self, sampler="ddim").steps()
-        return sampler.follow(rows, _unguided(denoise), noise, every_step=every_step)
-
-    def dpm(
-        self,
         denoise: Denoiser,
         noise: Array,
         key: Array | None = None,
@@ -197,30 +182,35 @@ class DDPMConfig(Noise):
         step_noise: Array | None = None,
         every_step: bool = False,
     ) -> Array:
-        """Sample by SDE-DPM-Solver++ (2M) (Lu et al. 2022; ``CogVideoXDPMScheduler``).
+        """Sample with the configured sampler; see ``Noise.sample``.
 
         Args:
-            denoise: ``(x_t, levels_B) -> x0``.
+            denoise: ``(x_t, levels_B, weight) -> x0``; the weights are ``guidance_weights``.
             noise: (B, …) standard normal start.
-            key: randomness of the fresh noise; step k draws from ``fold_in(key, k)``.
-            step_noise: (sample_steps, B, …) the fresh noise itself, in place of a key.
+            key: randomness of the fresh noise of ``dpm``; step k draws from ``fold_in(key, k)``.
+            step_noise: (sample_steps, B, …) the fresh noise itself, instead of a key.
             every_step: return the sample after every step, (sample_steps, B, …).
 
-        Returns:
-            (B, …) the sample, whatever the ``sampler`` setting says.
-
         Raises:
-            ValueError: both or neither of key and step_noise are given, or step_noise has a wrong
-                shape.
+            ValueError: the sampler is dpm and both or neither of key and step_noise are given, or
+                step_noise has another shape.
         """
+        if self.sampler == "ddim":
+            return follow(self.steps(), denoise, noise, every_step=every_step)
         if (key is None) == (step_noise is None):
-            raise ValueError("dpm() draws fresh noise at every step: give it a key, or step_noise.")
+            raise ValueError(
+                "noise.sampler dpm draws fresh noise at every step: give it a key, or step_noise."
+            )
         shape = (self.sample_steps, *noise.shape)
         if step_noise is not None and step_noise.shape != shape:
-            raise ValueError(f"dpm() got step_noise of shape {step_noise.shape}; it needs {shape}.")
-        fresh = _draw(key, noise) if step_noise is None else jnp.asarray(step_noise).__getitem__
-        rows = dataclasses.replace(self, sampler="dpm").steps()
-        return sampler.follow(rows, _unguided(denoise), noise, fresh, every_step=every_step)
+            raise ValueError(f"step_noise has the shape {step_noise.shape}; it needs {shape}.")
+
+        def fresh(k: Array) -> Array:
+            if step_noise is not None:
+                return jnp.asarray(step_noise)[k]
+            return jax.random.normal(jax.random.fold_in(key, k), noise.shape, noise.dtype)
+
+        return follow(self.steps(), denoise, noise, fresh, every_step=every_step)
 
     def alphas_cumprod(self) -> np.ndarray:
         """Return (train_steps,) ᾱ from almost 1 down to exactly 0 (zero terminal SNR)."""
@@ -247,11 +237,12 @@ class DDPMConfig(Noise):
         share = (count - self.levels().astype(np.float64)) / count
         return 1 + self.guidance * (1 - np.cos(np.pi * share**5)) / 2
 
-    def steps(self) -> sampler.Steps:
-        """Return the coefficients of the configured sampler's steps."""
-        return sampler.steps(
-            self.sampler, self.levels(), *self.signal_power(), self.guidance_weights()
-        )
+    def steps(self) -> Steps:
+        """Return the float32 coefficients of the configured sampler, in the order of the steps."""
+        levels = self.levels()
+        rows = {"ddim": _ddim, "dpm": _dpm}[self.sampler](*self.signal_power())
+        weights = (*rows, self.guidance_weights())
+        return Steps(levels, *(np.asarray(row, np.float32) for row in weights))
 
     def signal_power(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return (steps,) ᾱ of each visited level, of the next one, and of the previous one.
@@ -278,11 +269,65 @@ class DDPMConfig(Noise):
         return self.expand(signal, ndim), self.expand(noise, ndim)
 
 
-def _unguided(denoise: Denoiser) -> Callable[[Array, Array, Array], Array]:
-    """Make a denoiser accept, and ignore, the weight of guidance."""
-    return lambda x, levels, _weight: denoise(x, levels)
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
-def _draw(key: Array, like: Array) -> Callable[[Array], Array]:
-    """Return a function from a step's number to its standard normal noise."""
-    return lambda k: jax.random.normal(jax.random.fold_in(key, k), like.shape, like.dtype)
+def _ddim(now: np.ndarray, after: np.ndarray, _before: np.ndarray) -> Rows:
+    """DDIM with η = 0 (Song et al. 2021, Eq. 12)."""
+    keep = np.sqrt((1 - after) / np.maximum(1 - now, 1e-12))
+    add = np.sqrt(after) - np.sqrt(now) * keep
+    return keep, add, np.zeros_like(now), np.zeros_like(now)
+
+
+def _dpm(now: np.ndarray, after: np.ndarray, before: np.ndarray) -> Rows:
+    """SDE-DPM-Solver++ (2M) (Lu et al. 2022, arXiv 2211.01095), finite at ᾱ = 0 and 1."""
+    decay = np.sqrt(now * (1 - after) / (after * (1 - now)))
+    keep = np.sqrt((1 - after) / (1 - now)) * decay
+    fresh = 1 - decay**2
+    mix = np.zeros_like(now)
+    for i in np.flatnonzero(~np.isnan(before)):
+        if before[i] > 0:  # from pure noise the step is of first order: mix is 0
+            mix[i] = (_rise(now[i], after[i]) / _rise(before[i], now[i])) / 2
+    return keep, fresh * np.sqrt(after), mix, np.sqrt((1 - after) * fresh)
+
+
+def _rise(low: float, high: float) -> float:
+    """Return the increase of log-SNR/2 between two levels."""
+    return 0.5 * (np.log(high / (1 - high)) - np.log(low / (1 - low)))
+
+
+def follow(
+    rows: Steps,
+    denoise: Denoiser,
+    start: Array,
+    fresh: Callable[[Array], Array] | None = None,
+    *,
+    every_step: bool = False,
+) -> Array:
+    """Scan the update over the steps.
+
+    Args:
+        rows: the coefficients of all steps.
+        denoise: ``(x_t, levels_B, weight) -> x0``.
+        start: (B, …) standard normal.
+        fresh: ``fresh(k)`` is the noise that step k adds; None for a sampler that adds none.
+        every_step: return the sample after every step, (steps, B, …), not only the last one.
+    """
+
+    def step(carry, inputs):
+        x, earlier = carry
+        row, k = inputs
+        x0 = denoise(x, jnp.full((x.shape[0],), row.timestep), row.guidance).astype(jnp.float32)
+        if fresh is None:
+            x = row.keep * x + row.add * x0
+        else:
+            ahead = (1 + row.mix) * x0 - row.mix * earlier
+            x = row.keep * x + row.add * ahead + row.spread * fresh(k)
+            earlier = x0
+        x = x.astype(start.dtype)
+        return (x, earlier), x if every_step else None
+
+    first = (start, None if fresh is None else jnp.zeros(start.shape, jnp.float32))
+    inputs = (jax.tree.map(jnp.asarray, rows), np.arange(rows.timestep.shape[0]))
+    (sample, _), path = jax.lax.scan(step, first, inputs)
+    return path if every_step else sample

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config.parts import Denoiser, Noise
-from pewm_jax.errors import require, require_positive
+from pewm_jax.errors import require, require_fields, require_positive
 from pewm_jax.types import Array
 
 
@@ -42,10 +42,7 @@ class FlowConfig(Noise):
     def __post_init__(self):
         """Validate."""
         require_positive(self, "noise", "sample_steps")
-        require(
-            self.shift > 0 and self.scale > 0,
-            f"noise.shift is {self.shift} and noise.scale {self.scale}: use numbers above 0.",
-        )
+        require_fields(self, "noise", lambda value: value > 0, "a number above 0", "shift", "scale")
 
     @property
     def velocity_in_unit_time(self) -> bool:
@@ -110,8 +107,8 @@ class FlowConfig(Noise):
 class FrameFlowConfig(FlowConfig):
     """x_t = (1 − t) x0 + (s + (1 − s) t) ε, velocity (1 − s) ε − x0.
 
-    A little noise, s, is left at t = 0 (arXiv 2210.02747). With ``per_frame`` each frame has a time
-    of its own (diffusion forcing, arXiv 2407.01392); frames that are given have some noise, too.
+    A little noise, s, is left at t = 0 (arXiv 2210.02747). With ``per_frame`` each frame has its
+    own time (diffusion forcing, arXiv 2407.01392); given frames have some noise, too.
     ``PERSIST_VOXELS`` and ``PERSIST_PIXELS`` are the published settings.
     """
 
@@ -137,9 +134,8 @@ class FrameFlowConfig(FlowConfig):
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
-        for name in ("smallest", "context_noise"):
-            value = getattr(self, name)
-            require(0 <= value < 1, f"noise.{name} is {value}: use 0 or more, below 1.")
+        names, hint = ("smallest", "context_noise"), "0 or more, below 1"
+        require_fields(self, "noise", lambda value: 0 <= value < 1, hint, *names)
         require(
             self.times != "ends" or (self.per_frame and self.sample_steps == 1),
             f"noise.times is ends with noise.per_frame {self.per_frame} and noise.sample_steps "
@@ -178,11 +174,6 @@ class FrameFlowConfig(FlowConfig):
         """Return ((1 − s) x_t − x0) / (s + (1 − s) t), the velocity that leads to x0."""
         time, least = self.expand(time_B, x_t.ndim), self.smallest
         return ((1 - least) * x_t - x0) / (least + (1 - least) * time)
-
-    def noisy_context(self, x0: Array, key: Array) -> tuple[Array, Array]:
-        """Return known frames (B, T, …) with the noise of ``context_noise``, and times (B, T)."""
-        times = jnp.full(x0.shape[:2], self.context_noise)
-        return self.corrupt(x0, jax.random.normal(key, x0.shape, x0.dtype), times), times
 
     def sample(self, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
         """Follow the flow from t = 1 by Euler's method.

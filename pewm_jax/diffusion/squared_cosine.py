@@ -1,10 +1,10 @@
 """DDPM in a few levels with cosine noise, for short vectors such as a policy's waypoints.
 
 The levels are those of Nichol and Dhariwal 2021 (arXiv 2102.09672, Eq. 17; ``squaredcos_cap_v2`` in
-diffusers), the network predicts the noise, and every level is visited once, from the noisiest down
-(Ho et al. 2020, Alg. 2), with the estimate of the clean vector cut to [−1, 1]. Equal to
+diffusers). The network predicts the noise, and every level is visited once, from the noisiest down
+(Ho et al. 2020, Alg. 2), with the estimate of the clean vector clipped to [−1, 1]. Equal to
 ``DDPMScheduler`` with ``prediction_type="epsilon"``, ``clip_sample=True`` and as many steps as
-levels. (``diffusion.ddpm`` has the levels of video models, and their samplers.)
+levels. ``levels`` is their number; time is an integer from 0, the least noise, to levels − 1.
 """
 
 from __future__ import annotations
@@ -31,28 +31,16 @@ def alphas_cumprod(levels: int) -> np.ndarray:
 
 
 def corrupt(levels: int, clean: Array, noise: Array, time_B: Array) -> Array:
-    """Return √ᾱ · clean + √(1 − ᾱ) · noise.
-
-    Args:
-        levels: number of levels.
-        clean: (B, …).
-        noise: (B, …) standard normal.
-        time_B: (B,) integers from 0, the least noise, to levels − 1.
-    """
+    """Return √ᾱ · clean + √(1 − ᾱ) · noise of (B, …) vectors at the levels (B,)."""
     alphas = alphas_cumprod(levels)
     kept, added = (jnp.asarray(np.sqrt(x), jnp.float32)[time_B] for x in (alphas, 1 - alphas))
     return Noise.expand(kept, clean.ndim) * clean + Noise.expand(added, clean.ndim) * noise
 
 
 def back(levels: int, predicted: Array, noisy: Array, time: Array, noise: Array) -> Array:
-    """Return the vector one level less noisy.
+    """Return the vector one level less noisy; from level 0 the clean estimate.
 
-    Args:
-        levels: number of levels.
-        predicted: the noise that the network sees in ``noisy``.
-        noisy: any shape.
-        time: () integer, the level of ``noisy``; from 0 the clean estimate is returned.
-        noise: standard normal, of the same shape; not used at level 0.
+    ``predicted`` is the network's noise, ``noise`` fresh standard normal noise, unused at level 0.
     """
     alphas = alphas_cumprod(levels)
     before = np.append(1.0, alphas[:-1])
@@ -75,14 +63,7 @@ def back(levels: int, predicted: Array, noisy: Array, time: Array, noise: Array)
 def sample(
     levels: int, predict: Callable[[Array, Array], Array], shape: tuple[int, ...], key: Array
 ) -> Array:
-    """Draw a vector, from pure noise down.
-
-    Args:
-        levels: number of levels.
-        predict: ``predict(noisy, time) -> noise``, with a scalar time.
-        shape: of the vector.
-        key: randomness.
-    """
+    """Sample a vector of a shape from noise, with ``predict(noisy, time) -> noise``."""
     start, rest = jax.random.split(key)
 
     def step(noisy: Array, time: Array) -> tuple[Array, None]:

@@ -1,7 +1,7 @@
 """The codec as image encoder: the memory keeps the denoiser's latents.
 
 Features of a frame are the codec's normalised latents of its colours, at the grid of the latents;
-depth says where they are, and is not encoded. There are no parameters besides the codec's.
+depth gives their positions and is not encoded. There are no parameters besides the codec's.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pewm_jax.types import Array, Params
 
 @dataclasses.dataclass(frozen=True)
 class LatentsConfig(Encoder):
-    """The colours' latents of each frame, as the model's own codec makes them; no other weights."""
+    """The codec's latents of the colours of each frame; no other weights."""
 
     WEIGHTS: ClassVar[str] = "codec"
 
@@ -32,7 +32,7 @@ class LatentsConfig(Encoder):
         return clip.height // self.spatial, clip.width // self.spatial
 
     def check(self, model: Any) -> None:
-        """Refuse another codec than the settings describe, and one that folds frames."""
+        """Refuse a codec that differs from the settings or folds frames."""
         q, channels, side = model.codec.temporal, model.codec.rgb_channels, model.codec.spatial
         require(
             q == 1,
@@ -52,7 +52,7 @@ class LatentsConfig(Encoder):
         require_positive(self, "memory.encoder", "channels", "spatial")
 
     def encode(self, params: Params, rgb_THWC: Array) -> Array:
-        """Refuse: the features are the codec's latents, which need the model; see ``features``."""
+        """Refuse: the codec's latents need the model; see ``features``."""
         del params, rgb_THWC
         self.require_own("cannot be made without the model")
 

@@ -1,4 +1,4 @@
-"""The small image encoder, without weights: the mean colour c of each patch, and −c.
+"""The image encoder without weights: the mean colour c of each patch, and −c.
 
 The map keeps the maximum over all views. A cell therefore holds the largest value of each colour
 channel and, through −c, the smallest one. The middle of the two is the cell's colour.
@@ -49,7 +49,7 @@ class PatchColoursConfig(Encoder):
         return patch_colours(rgb_THWC, self.patch)
 
     def preprocessing(self) -> dict[str, Any]:
-        """Return what the features depend on."""
+        """Return the settings of the features."""
         return {"network": {}, "preprocessing": {"patch": self.patch}}
 
     def colours(self, features_VF: np.ndarray) -> np.ndarray:
@@ -59,12 +59,7 @@ class PatchColoursConfig(Encoder):
 
 
 def patch_colours(rgb_THWC: Array, patch: int) -> Array:
-    """Return (T, H/p, W/p, 6): mean colour of each patch and its negative.
-
-    Args:
-        rgb_THWC: (T, H, W, 3) float in [−1, 1].
-        patch: p, pixels.
-    """
+    """Return (T, H/p, W/p, 6): mean of each patch of p × p pixels of colours, and its negative."""
     frames, height, width, _ = rgb_THWC.shape
     grid = rgb_THWC.reshape(frames, height // patch, patch, width // patch, patch, 3)
     mean = grid.mean((2, 4))

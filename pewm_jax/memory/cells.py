@@ -1,12 +1,11 @@
 """Grid cells shared by the memories: cell numbers, sorted lists of cells, boxes, choice of tokens.
 
 A sparse map is a sorted list of cell numbers, free slots last, with one row of features per slot.
-Cells are found by binary search, so time and memory use are independent of the grid's extent. The
-layout is canonical: maps with equal cells and features are equal bit for bit, whatever their
-history.
+Cells are found by binary search, so time and memory use are independent of the grid's extent. Maps
+with equal cells and features are equal bit for bit, whatever their history.
 
 A box is (2, 3), its lower and upper corner in the world, metres; lower faces belong to it, upper
-ones do not. A transform is a rigid (4, 4) matrix from old to new positions.
+faces do not. A transform is a rigid (4, 4) matrix from old to new positions.
 """
 
 from __future__ import annotations
@@ -70,16 +69,11 @@ def grid_of(height: int, width: int, most: int) -> tuple[int, int]:
 def sample(
     frames: Frames, rows: int, columns: int, valid_T: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """Sample the pixels at the centres of an even grid over each frame.
-
-    Args:
-        frames: T frames.
-        rows: rows of the grid.
-        columns: columns of the grid.
-        valid_T: (T,) bool, False frames have no valid pixel.
+    """Sample the pixels at the centres of an even grid over each of T frames.
 
     Returns:
-        ``(points_TP3, rgb_TPC, valid_TP)``, P = rows × columns; pixels without depth are invalid.
+        ``(points_TP3, rgb_TPC, valid_TP)``, P = rows × columns; pixels without depth, and those of
+        frames where ``valid_T`` is False, are invalid.
     """
     count, height, width = frames.depth_THW.shape
     row = ((np.arange(rows) + 0.5) * height / rows).astype(int)
@@ -106,8 +100,8 @@ def choose(
 ) -> Array:
     """Return (≤ ``memory.tokens``,) indices of the points that condition one clip.
 
-    By ``memory.choose``: those that the clip's cameras can see first (``geometry.zbuffer``), or
-    those in view by their distance (``in_view_first``).
+    By ``memory.choose``: points that the clip's cameras can see first (``geometry.zbuffer``), or
+    points in view by their distance (``in_view_first``).
 
     Args:
         config: gives order, number and the size of a cell.
@@ -115,7 +109,7 @@ def choose(
         valid_V: (V,) bool.
         camera: (T,) cameras of the clip.
         size: image height and width in pixels.
-        wide_V: (V,) widths of the points, metres, if they are not those of a cell.
+        wide_V: (V,) widths of the points, metres; by default those of a cell.
     """
     if config.choose == "nearest":
         return in_view_first(points_V3, valid_V, camera, size, config.tokens)
@@ -127,18 +121,11 @@ def choose(
 def in_view_first(
     points_P3: Array, valid_P: Array, camera: Camera, size: tuple[int, int], count: int
 ) -> Array:
-    """Return (≤ count,) indices of the points that condition one clip.
+    """Return (≤ count,) indices of points: first those in view of any camera, nearest first.
 
-    Points in view of any of the clip's cameras come first, nearest first (by the smallest depth at
-    which a camera sees them). The others follow, by distance to the nearest camera; invalid points
-    are last. Ties go to the lower index.
-
-    Args:
-        points_P3: world points, metres.
-        valid_P: (P,) bool.
-        camera: (T,) cameras of the clip.
-        size: image height and width in pixels.
-        count: the most indices to return; fewer if there are fewer points.
+    The nearest is the one with the smallest depth in any camera. The others follow, by distance to
+    the nearest camera; invalid points are last. Ties go to the lower index. Arguments as for
+    ``choose``.
     """
     uv, z = project(points_P3[None], camera)
     seen = jnp.all((uv >= 0) & (uv <= np.array([size[1], size[0]], np.float32)), -1) & (z > 0)
@@ -156,11 +143,7 @@ def nowhere(config: Memory) -> int:
 
 
 def find(cell_V: Array, cell_P: Array) -> tuple[Array, Array]:
-    """Look cells up.
-
-    Args:
-        cell_V: (V,) the cells of a map, sorted.
-        cell_P: (P,) cells to find, in any order.
+    """Look cells ``cell_P`` up in a sorted list ``cell_V``.
 
     Returns:
         ``(slot_P, found_P)``; the slot is meaningless if the cell is not found.
@@ -171,9 +154,7 @@ def find(cell_V: Array, cell_P: Array) -> tuple[Array, Array]:
 
 
 def admit(cell_V: Array, cell_P: Array, no_cell: int) -> tuple[Array, Array]:
-    """Add cells to a map's list while there is room.
-
-    Cells already in the map stay. New cells are admitted in the order of their numbers.
+    """Add cells to a map's list while there is room, in the order of their numbers.
 
     Args:
         cell_V: (V,) the cells of a map, sorted, ``no_cell`` where a slot is free.
@@ -196,14 +177,7 @@ def admit(cell_V: Array, cell_P: Array, no_cell: int) -> tuple[Array, Array]:
 
 
 def relocate(old_V: Array, features_VF: Array, new_V: Array, no_cell: int) -> Array:
-    """Move rows of features to the slots of a new list of cells; −inf where a cell is new.
-
-    Args:
-        old_V: (V,) the cells the rows belong to, sorted.
-        features_VF: (V, F) features.
-        new_V: (V,) the new list, sorted.
-        no_cell: the number that stands for no cell.
-    """
+    """Move rows of features to the slots of a new sorted list; −inf where a cell is new."""
     slot, found = find(old_V, new_V)
     held = found & (new_V < no_cell)
     lowest = jnp.asarray(-jnp.inf, features_VF.dtype)
@@ -213,18 +187,18 @@ def relocate(old_V: Array, features_VF: Array, new_V: Array, no_cell: int) -> Ar
 def maximum_over_blocks(
     features_VF: Array, count: Array, size: int, read: Callable[[Array, int], tuple[Array, Array]]
 ) -> Array:
-    """Scatter-max ``count`` rows, block by block, so that only one block of rows exists at a time.
+    """Scatter-max ``count`` ≤ ``size`` rows, block by block, so that only one block of rows exists.
 
     Args:
         features_VF: (V, F) the rows so far.
-        count: () number of rows to read, ≤ ``size``.
+        count: () number of rows to read.
         size: the largest number of rows.
         read: ``(start, b)`` → ``(slot_b, rows_bF)``, b rows from ``start`` on; rows with slot V are
             ignored. A row may be requested twice, and so may rows beyond ``count``.
 
     Returns:
-        (V, F) in the dtype of ``features_VF``. Maxima are computed in float32. Rounding preserves
-        order, so the result is the same as in the narrower dtype.
+        (V, F) in the dtype of ``features_VF``. Maxima are computed in float32; rounding preserves
+        order, so the result is that of the narrower dtype.
     """
     exact = jnp.promote_types(features_VF.dtype, jnp.float32)
 
@@ -263,15 +237,10 @@ def _(_axis_size: int, _in_batched: list[bool], count: Array) -> tuple[Array, bo
 
 
 def within(points_V3: Array, valid_V: Array, box_23: Array) -> Array:
-    """Return (V,) bool: which valid points lie in a box.
-
-    Args:
-        points_V3: (V, 3) world points, metres.
-        valid_V: (V,) bool.
-        box_23: (2, 3) lower and upper corner.
+    """Return (V,) bool: which valid points (V, 3), metres, lie in a box.
 
     Raises:
-        UserError: the box is not a box.
+        UserError: the box is invalid.
     """
     box_23 = jnp.asarray(box_23, jnp.float32)
     if box_23.shape != (2, 3):
@@ -287,11 +256,7 @@ def within(points_V3: Array, valid_V: Array, box_23: Array) -> Array:
 
 
 def rigid(transform: Array | None, who: str) -> Array:
-    """Return a (4, 4) float32 transform; None is the identity.
-
-    Args:
-        transform: rigid, from old to new positions, metres.
-        who: the function that got it, for the message.
+    """Return a rigid (4, 4) float32 transform; None is the identity. ``who`` is named in errors.
 
     Raises:
         UserError: it is not a rigid 4×4 (under jit only its shape is checked).

@@ -3,9 +3,9 @@
 A cell holds −1 if it is unknown, 0 if it is empty, else a class. The networks of the world predict
 the cells from observed frames (``worlds.persist``).
 
-Edits are in world coordinates (metres): a box is (2, 3), its lower and upper corner, and a cell
-belongs to it if its centre lies in it; a transform is a rigid 4×4 matrix from old to new positions.
-Erased cells are empty, not unknown. All functions are pure and jittable with ``config`` static.
+A box is (2, 3), its lower and upper corner in the world, metres; a cell belongs to it if its centre
+lies in it. A transform is a rigid 4×4 matrix from old to new positions. Erased cells are empty, not
+unknown. All functions are pure and jittable with ``config`` static.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class ClassGrid:
     Attributes:
         classes_XYZ: (X, Y, Z) int16 class ids; ``UNKNOWN`` where nothing is known.
         low_3: (3,) float32 world position of the lowest corner, metres.
-        history: what the world's networks keep of the frames before; None in a grid by itself.
+        history: what the world's networks keep of earlier frames; None outside a world.
     """
 
     classes_XYZ: Array
@@ -51,16 +51,10 @@ class ClassGrid:
 
 
 def place(config: Memory, grid: ClassGrid, box_23: Array, number: int | Array) -> ClassGrid:
-    """Fill a box with a class.
-
-    Args:
-        config: the grid's settings.
-        grid: the grid.
-        box_23: (2, 3) lower and upper corner in the world, metres.
-        number: the class's id; see ``number_of``.
+    """Fill a box with a class id; see ``number_of``.
 
     Raises:
-        UserError: the box is not a box, or the id is not of the table.
+        UserError: the box is invalid, or the id is not of the table.
     """
     if not isinstance(number, Tracer):
         given, table = np.asarray(number), VoxelsConfig(kinds=config.kinds, colours=config.colours)  # type: ignore[attr-defined]
@@ -75,29 +69,19 @@ def place(config: Memory, grid: ClassGrid, box_23: Array, number: int | Array) -
 
 
 def erase(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
-    """Leave nothing in a box.
-
-    Args:
-        config: the grid's settings.
-        grid: the grid.
-        box_23: (2, 3) lower and upper corner in the world, metres.
+    """Empty a box.
 
     Raises:
-        UserError: the box is not a box.
+        UserError: the box is invalid.
     """
     return place(config, grid, box_23, EMPTY)
 
 
 def copy(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
-    """Return a grid of what is in a box; elsewhere nothing is known.
-
-    Args:
-        config: the grid's settings.
-        grid: the grid.
-        box_23: (2, 3) lower and upper corner in the world, metres.
+    """Return a grid of what is in a box; all other cells are unknown.
 
     Raises:
-        UserError: the box is not a box.
+        UserError: the box is invalid.
     """
     inside = _within(config, grid, box_23) & (grid.classes_XYZ > EMPTY)
     kept = jnp.where(inside, grid.classes_XYZ, jnp.int16(UNKNOWN))
@@ -107,7 +91,7 @@ def copy(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
 def paste(
     config: Memory, grid: ClassGrid, piece: ClassGrid, transform: Array | None = None
 ) -> ClassGrid:
-    """Put a piece into a grid; where it has something, that replaces what was there.
+    """Insert a piece into a grid; its occupied cells replace those of the grid.
 
     Each cell takes the cell of the piece that its centre comes from (inverse warping), so a rotated
     piece has no holes. Quarter turns and shifts by whole cells are exact.
@@ -141,17 +125,12 @@ def move(
     *,
     leave: bool = False,
 ) -> ClassGrid:
-    """Move what is in a box: copy it, erase it, paste it elsewhere.
+    """Move what is in a box by a rigid (4, 4) transform: copy, erase, paste.
 
-    Args:
-        config: the grid's settings.
-        grid: the grid.
-        box_23: (2, 3) lower and upper corner in the world, metres.
-        transform: (4, 4) rigid, from old to new positions, metres.
-        leave: erase nothing: a copy.
+    With ``leave`` the content also stays in place.
 
     Raises:
-        UserError: the box is not a box, or the transform not a rigid 4×4.
+        UserError: the box is invalid, or the transform is not a rigid 4×4.
     """
     piece = copy(config, grid, box_23)
     rest = grid if leave else erase(config, grid, box_23)
@@ -182,7 +161,7 @@ def number_of(config: GridConfig, name: str) -> int:
     """Return the id of a class by its name, such as ``furniture/red``.
 
     Raises:
-        UserError: there is none.
+        UserError: there is no such class.
     """
     table = names(config)
     if name not in table:
@@ -199,7 +178,7 @@ def _colours(config: GridConfig) -> Array:
 class GridConfig(Memory):
     """The state of the world: class ids of all cells that were ever near the agent.
 
-    A frame's voxels are a window of it around the agent; what leaves the window is kept.
+    A frame's voxels are a window of it around the agent; cells outside the window are kept.
     """
 
     KEEPS_FEATURES: ClassVar[bool] = False
@@ -232,7 +211,7 @@ class GridConfig(Memory):
         return math.prod(self.cells)
 
     def check(self, model: Any) -> None:
-        """Refuse a grid that the networks do not fit."""
+        """Refuse a grid that does not fit the networks."""
         require(
             hasattr(model, "voxel_noise"),
             "memory.kind grid is the state of the world persist: use model.kind persist.",
@@ -255,12 +234,10 @@ class GridConfig(Memory):
         )
 
     def empty(self, model: AssembledModel, centre_3: Array) -> ClassGrid:
-        """Return a grid of unknown cells.
+        """Return a grid of unknown cells around a camera at ``centre_3``.
 
-        Args:
-            model: the model.
-            centre_3: (3,) camera at its centre, metres; the floor, ``eye_m`` below it, is a border
-                between cells, and horizontally cells lie at multiples of their side.
+        The floor, ``eye_m`` below the camera, is a border between cells; horizontally cells lie at
+        multiples of their side.
         """
         del model
         cell, centre = self.cell_m[0], jnp.asarray(centre_3, jnp.float32)
@@ -281,15 +258,7 @@ class GridConfig(Memory):
     def render(
         self, model: AssembledModel, memory: ClassGrid, camera: Camera, height: int, width: int
     ) -> View:
-        """Render the cells in the colours of their classes, by ray marching.
-
-        Args:
-            model: the model.
-            memory: the grid.
-            camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-            height: of the images, pixels.
-            width: of the images, pixels.
-        """
+        """Render the cells in the colours of their classes, by ray marching."""
         del model
         ids = jnp.maximum(memory.classes_XYZ, 0).astype(jnp.int32)
         cell = self.cell_m[0]
@@ -309,22 +278,14 @@ class GridConfig(Memory):
         *,
         observed: bool = True,
     ) -> NoReturn:
-        """Refuse: the networks of the world predict the cells.
-
-        Raises:
-            UserError: always.
-        """
+        """Refuse: the networks of the world predict the cells."""
         del model, params, memory, frames, features_ThwF, valid_T, observed
         raise UserError(
             "A grid of classes takes no frames by itself: use pewm_jax.start and pewm_jax.observe."
         )
 
     def read(self, model: AssembledModel, memory: ClassGrid, camera: Camera) -> NoReturn:
-        """Refuse: nothing attends to the cells.
-
-        Raises:
-            UserError: always.
-        """
+        """Refuse: nothing attends to the cells."""
         del model, memory, camera
         raise UserError("A grid of classes has no tokens: the world persist renders it by rays.")
 

@@ -1,8 +1,8 @@
-"""How much of what was seen before reaches the denoiser: remembered, chosen, looked at.
+"""How much of what was seen before reaches the denoiser: remembered, chosen, attended to.
 
-A pixel of a frame to be imagined that was seen before can be known only if the memory holds the
-place that it shows, if that place is among the tokens that condition the clip, and if the frame's
-own camera attends to it; or, where the memory is rendered, if the rendering shows that place.
+A pixel that was seen before can be known only if the memory holds its place, if that place is among
+the tokens that condition the clip, and if the frame's own camera attends to it; or, where the
+memory is rendered, if the rendering shows that place.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class Coverage:
 
     Attributes:
         seen: pixels seen before, with a depth.
-        held: of these, whose place the memory holds.
-        chosen: whose place is among the clip's tokens.
-        attended: whose place is among the tokens that the frame's camera attends to; with positions
-            that know no cameras all that are chosen.
-        rendered: where the rendered memory's depth agrees with the true one.
+        held: of these, pixels whose place the memory holds.
+        chosen: pixels whose place is among the clip's tokens.
+        attended: pixels whose place is among the tokens that the frame's camera attends to; equal
+            to ``chosen`` with positions that depend on no camera.
+        rendered: pixels where the rendered memory's depth agrees with the true one.
         looked_at: what the memory's reader reads of these: ``attended`` where it reads tokens,
             ``rendered`` where it reads pictures, either where it reads both.
     """
@@ -56,19 +56,19 @@ def coverage(
     seen_THW: Array,
     reader: AttentionConfig | None = None,
 ) -> Coverage:
-    """Count the pixels seen before that are remembered, chosen, looked at and rendered.
+    """Count the pixels seen before that are remembered, chosen, attended to and rendered.
 
     A place is a cell of the memory's grid; for surfels, whose cells are about as small as pixels,
     that cell or one beside it.
 
     Args:
         model: the model.
-        memory: what is remembered, of one world.
+        memory: the memory of one world.
         tokens: the clip's tokens (``Memory.read``).
         frames: T true frames of the clip, with depth.
         seen_THW: (T, H, W) bool, pixels seen before.
-        reader: settings of the attention, by default the memory's reader; where that is of another
-            kind, all that is chosen counts as attended to.
+        reader: settings of the attention, by default the memory's reader; with another kind of
+            reader all chosen tokens count as attended to.
     """
     depth = jnp.asarray(frames.depth_THW)
     _, height, width = depth.shape

@@ -44,7 +44,7 @@ Dtype = Literal["float16", "bfloat16", "float32"]
 
 @dataclasses.dataclass(frozen=True)
 class FeatureCache:
-    """An opened cache of one split; see ``open_cache`` and ``features``.
+    """An open cache of one split; see ``open_cache`` and ``features``.
 
     Attributes:
         path: its folder.
@@ -63,11 +63,6 @@ def fingerprint(config: Encoder, params: Params, data: Manifest) -> dict[str, An
     Weights are identified by a hash of their float32 values, whatever dtype they are stored in;
     data by the hashes of the split's shards.
 
-    Args:
-        config: the encoder.
-        params: the encoder's parameters, empty where it has none.
-        data: the split's manifest.
-
     Raises:
         UserError: the features are the codec's latents.
     """
@@ -82,13 +77,7 @@ def fingerprint(config: Encoder, params: Params, data: Manifest) -> dict[str, An
 
 
 def open_cache(path: Path, config: Encoder, params: Params, data: Path) -> FeatureCache:
-    """Open a finished cache, if it belongs to this encoder and this data.
-
-    Args:
-        path: the cache of one split.
-        config: the encoder.
-        params: the encoder's parameters, empty where it has none.
-        data: the split that it should belong to.
+    """Open a finished cache, if it was made with this encoder and this split of data.
 
     Raises:
         UserError: it is absent, unfinished, damaged or stale (made with other weights, other
@@ -100,26 +89,14 @@ def open_cache(path: Path, config: Encoder, params: Params, data: Path) -> Featu
 
 
 def require_fresh(cache: FeatureCache, config: Encoder, params: Params, data: Path) -> None:
-    """Refuse a stale cache; see ``open_cache``.
-
-    Raises:
-        UserError: it is stale; the message says what differs.
-    """
+    """Refuse a stale cache; see ``open_cache``."""
     refuse_stale(cache.path, cache.made_of, fingerprint(config, params, read_manifest(data)))
 
 
 def features(
     cache: FeatureCache, episode: Episode | str, frame_indices: Sequence[int] | np.ndarray
 ) -> np.ndarray:
-    """Return the features of some frames; only these are read from disk.
-
-    Args:
-        cache: from ``open_cache``.
-        episode: an episode of its data, or the name of one.
-        frame_indices: (T,) frame numbers, in any order.
-
-    Returns:
-        (T, h, w, F) in the stored dtype.
+    """Return (T, h, w, F) features of some frames of an episode; only these are read from disk.
 
     Raises:
         UserError: the cache has no such episode or frame, or its file is damaged.
@@ -140,11 +117,7 @@ def features(
 
 
 def refuse_stale(path: Path, have: Mapping[str, Any], want: Mapping[str, Any]) -> None:
-    """Refuse a cache whose fingerprint differs from the one wanted.
-
-    Raises:
-        UserError: the fingerprints differ; the message says in what.
-    """
+    """Refuse a cache whose fingerprint is not the one wanted; the error names the difference."""
     again = "make it again with `pewm-jax memory cache` in a new folder"
     for key in ("encoder", "network", "preprocessing"):
         old, new = have.get(key), want[key]
@@ -224,15 +197,12 @@ def build(
 
     Args:
         config: the encoder.
-        params: the encoder's parameters, empty where it has none.
+        params: the encoder's parameters, empty if it has none.
         data: a finished split.
         out: the folder to fill.
         dtype: dtype of the stored features.
         batch: frames encoded at once, rounded up to a multiple of the devices.
         log: shows a progress line.
-
-    Returns:
-        The finished cache.
 
     Raises:
         UserError: the data cannot be read, ``out`` holds another cache or is being filled by

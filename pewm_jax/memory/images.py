@@ -3,7 +3,7 @@
 3D-Mem clusters detected objects. Here, without a detector, a frame covers the set of map cells that
 its pixels fall into. Snapshots are chosen by greedy maximum coverage of all cells seen so far,
 which reaches at least 1 − 1/e of the best possible coverage by K frames. Tokens are the patches of
-the snapshots; a patch's position is the world point that its middle pixel shows.
+the snapshots; a patch's position is the world point of its middle pixel.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Snapshots:
 
 
 def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array, Array]:
-    """Choose sets greedily: each time the one that covers the most uncovered cells.
+    """Choose ``count`` sets greedily: each time the one that covers the most uncovered cells.
 
     Args:
         cell_XC: (X, C) the cells of each of X sets, in any order, with repetitions.
@@ -113,17 +113,7 @@ class ImagesConfig(Memory):
         *,
         observed: bool = True,
     ) -> Snapshots:
-        """Choose the best snapshots among the present ones and T new frames.
-
-        Args:
-            model: the model.
-            params: not used.
-            memory: the present ones; they win ties against new frames.
-            frames: T frames.
-            features_ThwF: (T, h, w, F) their patch features, pooled to the patches of a snapshot.
-            valid_T: (T,) bool; False frames are ignored.
-            observed: not used.
-        """
+        """Choose the best snapshots among the present ones, which win ties, and T new frames."""
         del params, observed
         shape = features_ThwF.shape
         rows, columns = self.patch_grid(model)
@@ -158,7 +148,7 @@ class ImagesConfig(Memory):
         )
 
     def to_points(self, model: AssembledModel, memory: Snapshots) -> tuple[Array, Array, Array]:
-        """Return all patches as ``(points_world_V3, features_VF, valid_V)``."""
+        """Return all patches of all snapshots."""
         del model
         channels = memory.features_KPF.shape[-1]
         return (

@@ -55,16 +55,9 @@ def insert(
     *,
     observed: bool = True,
 ) -> Memory:
-    """Return the memory after T more frames.
+    """Return the memory after T more frames, colours float in [−1, 1]; see ``Memory.insert``.
 
-    Args:
-        model: the model.
-        params: the world model's parameters, for memories whose update is learned.
-        memory: from ``model.memory.empty`` or from an earlier call.
-        frames: T frames, colours float in [−1, 1]; pixels without depth are ignored.
-        features_ThwF: (T, h, w, F) their patch features (``Encoder.features``).
-        valid_T: (T,) bool; False frames are ignored.
-        observed: False if the frames were imagined: of these only ``trusted`` pixels are inserted.
+    Only ``trusted`` pixels of imagined frames are inserted.
     """
     frames = frames if observed else trusted(model, frames)
     return model.memory.insert(
@@ -73,16 +66,12 @@ def insert(
 
 
 def trusted(model: AssembledModel, frames: Frames) -> Frames:
-    """Return imagined frames with a depth of 0 where it must not be inserted.
+    """Return imagined frames (..., T) with a depth of 0 where it must not be inserted.
 
     These pixels are beyond ``memory.imagined_far`` of ``clip.far_m`` (unobserved walls are imagined
     at the end of the range), at the near end of the range (where models put pixels without depth),
     and on both sides of an edge (``memory.imagined_edge``), where the imagined depth lies between
     two surfaces.
-
-    Args:
-        model: the model.
-        frames: (..., T) frames.
     """
     settings, clip = model.memory, model.clip
     depth = jnp.asarray(frames.depth_THW)
@@ -106,21 +95,11 @@ def trusted(model: AssembledModel, frames: Frames) -> Frames:
 def render(
     model: AssembledModel, memory: Memory, camera: Camera, height: int, width: int
 ) -> rendering.View:
-    """Render the memory for cameras; nearer points occlude farther ones.
+    """Render the memory for (T,) cameras whose intrinsics are for ``height`` × ``width`` pixels.
 
     Points are as wide as the cells of ``memory.cell_m``, unless the memory has its own ``render``.
-    Shapes are static. Large memories are drawn in branches, both of which ``jax.vmap`` computes:
-    render a batch with ``jax.lax.map``.
-
-    Args:
-        model: the model.
-        memory: what is remembered.
-        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: height of the images, pixels.
-        width: width of the images, pixels.
-
-    Returns:
-        The view; its features have ``model.memory.rendered_channels`` channels.
+    Large memories are drawn in branches, both of which ``jax.vmap`` computes: render a batch with
+    ``jax.lax.map``. The features have ``model.memory.rendered_channels`` channels.
     """
     own = model.memory.render(model, memory, camera, height, width)
     if own is not None:
@@ -155,12 +134,11 @@ def readout(
 
     Args:
         model: the model.
-        memory: what is remembered.
+        memory: the memory.
         camera: (T,) cameras of the clip, whose intrinsics are for images of its size.
-        params: the world model's parameters; those of the codec are used if the reader takes
-            latents, and they may be left out if it does not.
-        pictures: give the view even if the reader does not take it.
-        view: what ``render`` gives for these cameras, if it was made beforehand.
+        params: the world model's parameters; the codec's are used if the reader takes latents.
+        pictures: return the view even if the reader does not take it.
+        view: the rendering for these cameras, if it exists already.
     """
     reader = model.memory.reader
     seen, encoded = None, None
@@ -180,16 +158,10 @@ def readout(
 
 
 def encode(model: AssembledModel, params: Params, view: View) -> EncodedView:
-    """Encode a view of colours as the clip's frames are encoded.
+    """Encode a view of colours, (T,) images of the clip's size, as the clip's frames are encoded.
 
-    The codec knows whole images: a pixel that shows nothing gets colour and depth of the nearest
-    pixel of its image that shows something. An image that shows nothing is grey and at
-    ``clip.far_m``.
-
-    Args:
-        model: the model.
-        params: the world model's parameters; those of the codec are used.
-        view: (T,) images of the clip's size; the first 3 features are colours.
+    The codec encodes whole images: an unseen pixel gets colour and depth of the nearest seen pixel
+    of its image. An image without seen pixels is grey and at ``clip.far_m``.
     """
     whole = rendering.fill_nearest(view)
     depth = jnp.where(whole.depth_THW > 0, whole.depth_THW, model.clip.far_m)
@@ -210,8 +182,7 @@ def from_context(
 
     Args:
         model: the model.
-        params: the world model's parameters; those that make features (``Encoder.weights``) are
-            used.
+        params: the world model's parameters; those of ``Encoder.weights`` are used.
         context: S frames of one world, colours in [−1, 1].
         valid_S: (S,) bool, False frames are ignored.
         features_ShwF: (S, h, w, F) the encoder's features of the frames, if they are known.
@@ -228,15 +199,10 @@ def from_context(
 def edited(model: AssembledModel, state: WorldState, changed: Memory) -> WorldState:
     """Return a state with an edited memory, whose present frame shows the edit.
 
-    The next clip is conditioned on the present frame, which would otherwise still show what was
-    erased. Where the renderings of the memory before and after differ, pixels are taken from the
+    The next clip is conditioned on the present frame, which would otherwise still show the erased
+    content. Where the renderings of the memory before and after differ, pixels are taken from the
     later one; its holes are filled with the nearest pixels. The frame is unchanged if the memory is
     not rendered in colours.
-
-    Args:
-        model: the model.
-        state: the world before the edit.
-        changed: its edited memory.
     """
     frame = state.frame
     if not shows_colours(model):
@@ -250,3 +216,26 @@ def edited(model: AssembledModel, state: WorldState, changed: Memory) -> WorldSt
     rgb = jnp.where(apart[..., None], whole.features_THWF[..., :3], frame.rgb_THWC)
     depth = jnp.where(apart, whole.depth_THW, frame.depth_THW)
     return WorldState(Frames(rgb, depth, frame.camera), changed)
+
+
+class MemoryEdits:
+    """The methods ``erase`` and ``move`` of assembled worlds whose memory can be edited."""
+
+    def erase(self: Any, params: Params, state: WorldState, box_23: Array) -> WorldState:
+        """Erase a box from the memory and the present frame; see ``World.erase``."""
+        del params
+        return edited(self, state, self.memory.erase(self, state.map, box_23))
+
+    def move(
+        self: Any,
+        params: Params,
+        state: WorldState,
+        box_23: Array,
+        transform: Array,
+        *,
+        leave: bool = False,
+    ) -> WorldState:
+        """Move the content of a box in the memory and the present frame; see ``World.move``."""
+        del params
+        changed = self.memory.move(self, state.map, box_23, transform, leave=leave)
+        return edited(self, state, changed)

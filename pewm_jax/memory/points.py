@@ -49,14 +49,9 @@ class PointCloud:
 def insert(
     config: Memory, cloud: PointCloud, points_P3: Array, rgb_PC: Array, valid_P: Array
 ) -> PointCloud:
-    """Insert coloured points; new cells that do not fit are dropped, highest numbers first.
+    """Insert (P, 3) world points with colours in [−1, 1]; points with False are ignored.
 
-    Args:
-        config: cell size, extent, capacity.
-        cloud: the points so far.
-        points_P3: (P, 3) world points, metres.
-        rgb_PC: (P, 3) colours in [−1, 1].
-        valid_P: (P,) bool; False points are ignored.
+    New cells that do not fit are dropped, highest numbers first.
     """
     nowhere, capacity = math.prod(config.cells), cloud.cell_V.shape[0]
     cell_P = cells.keys(config, cloud.origin_3, points_P3)
@@ -126,10 +121,7 @@ class PointsConfig(Memory):
         return insert(self, memory, points.reshape(-1, 3), rgb.reshape(-1, 3), valid.reshape(-1))
 
     def to_points(self, model: AssembledModel, memory: PointCloud) -> tuple[Array, Array, Array]:
-        """Return all slots as ``(points_world_V3, features_VF, valid_V)``.
-
-        Features are the colour and a 1, then zeros up to the encoder's number of channels; free
-        slots are all 0.
+        """Return all slots; features are the colour, a 1, and zeros up to the encoder's channels.
 
         Raises:
             ValueError: the encoder has fewer than four channels.

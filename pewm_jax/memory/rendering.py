@@ -1,9 +1,13 @@
-"""Rendering points by splatting them into a z-buffer.
+"""Rendering of points by splatting them into a z-buffer.
 
 Shapes are static and the result is deterministic (``average`` adds in the order of the points on a
 CPU). ``splat`` lets each point cover the one pixel that it projects to; of several points at a
 pixel the nearest is seen, and ties go to the lowest index. Far surfaces show through between such
 points; ``splat_surfels`` gives points a size, so that they do not.
+
+Everywhere points are (V, 3) in the world, metres, features (V, F); points whose ``valid_V`` is
+False are ignored; the intrinsics of the (T,) cameras are for images of ``height`` × ``width``
+pixels.
 """
 
 from __future__ import annotations
@@ -39,16 +43,7 @@ WORTH_A_BRANCH = 4096
 def splat(
     points_V3: Array, features_VF: Array, valid_V: Array, camera: Camera, height: int, width: int
 ) -> View:
-    """Render points for cameras.
-
-    Args:
-        points_V3: (V, 3) in the world, metres.
-        features_VF: (V, F) their features.
-        valid_V: (V,) bool; False points are ignored.
-        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: height of the images, pixels.
-        width: width of the images, pixels.
-    """
+    """Render points for cameras."""
     count, pixels = len(points_V3), height * width
 
     def render(camera: Camera) -> tuple[Array, Array, Array]:
@@ -90,32 +85,32 @@ def splat_surfels(
     average: bool = True,
     normals_V3: Array | None = None,
 ) -> View:
-    """Return what cameras see of points that have a size, so that near surfaces hide far ones.
+    """Render points that have a size, so that near surfaces hide far ones.
 
     A point covers the pixels whose centres lie in a square of its size at its depth around it, and
-    always the pixel that it falls on. The nearest point that covers a pixel is its front; what
-    lies behind the front by more than a tolerance is hidden. Where no point in front falls on or
-    beside a pixel that is covered, the covering point is shown.
+    always the pixel that it falls on. The nearest point that covers a pixel is its front; points
+    behind the front by more than a tolerance are hidden. Where no point in front falls on or beside
+    a covered pixel, the covering point is shown.
 
-    Points in neighbouring slots are taken to be neighbours in the world, as those of a memory are:
-    where the blocks of ``BLOCK`` slots that reach into a camera's view are at most ``SHARE`` of
-    all, only they are drawn. That changes no result. It is a branch, of which ``jax.vmap`` runs
-    both sides: render a batch by ``jax.lax.map``.
+    Points in neighbouring slots are taken to be neighbours in the world, as in a memory: if the
+    blocks of ``BLOCK`` slots that reach into a camera's view are at most ``SHARE`` of all, only
+    they are drawn. That changes no result. It is a branch, both sides of which ``jax.vmap``
+    computes: render a batch with ``jax.lax.map``.
 
     Args:
-        points_V3: (V, 3) in the world, metres.
-        features_VF: (V, F).
+        points_V3: positions.
+        features_VF: features.
         size_V: (V,) widths, metres.
-        valid_V: (V,) bool; others are not there.
-        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: of the images, pixels.
-        width: of the images, pixels.
+        valid_V: which points exist.
+        camera: cameras.
+        height: of the images.
+        width: of the images.
         most: pixels that a point covers at most, across and down.
-        average: show the mean of all that is not hidden, each point shared bilinearly by the four
-            pixels around it; else the nearest point that falls on the pixel, as it is.
-        normals_V3: (V, 3) where points face, 0 for both ways. A point that faces away hides what is
-            behind it and is not shown: nothing is seen there, at its depth. None: all face both
-            ways.
+        average: show the mean of all points that are not hidden, each shared bilinearly by the four
+            pixels around it; else the nearest point that falls on the pixel.
+        normals_V3: (V, 3) directions that points face, 0 for both sides. A point that faces away
+            hides what is behind it and is not shown: nothing is seen there, at its depth. None: all
+            face both sides.
     """
     sides = () if normals_V3 is None else (normals_V3,)
     points_V3, features_VF, size_V, valid_V, *sides = _whole_blocks(
@@ -170,20 +165,12 @@ def splat_cells(
     height: int,
     width: int,
 ) -> View:
-    """Return what cameras see of cells: each pixel shows one cell, near ones hide far ones.
+    """Render cells: each pixel shows one cell, and near cells hide far ones.
 
-    A cell that is taller than wide is a pile of at most ``PILE`` square ones. The images are drawn
-    at most ``RASTER`` pixels long, in which a cell covers at most ``REACH`` across and down, and
-    their pixels repeated: cells are coarse, and what they cover costs.
-
-    Args:
-        points_V3: (V, 3) the middles of cells in the world, metres.
-        features_VF: (V, F).
-        cell_m: width, depth and height of a cell, metres.
-        valid_V: (V,) bool; others are not there.
-        camera: (T,) cameras, whose intrinsics are for images of ``height`` × ``width``.
-        height: of the images, pixels.
-        width: of the images, pixels.
+    A cell that is taller than wide is drawn as a pile of at most ``PILE`` square ones. Images are
+    drawn at most ``RASTER`` pixels long, where a cell covers at most ``REACH`` across and down, and
+    their pixels repeated: cells are coarse, and covered pixels are costly. ``cell_m`` is width,
+    depth and height of a cell, metres.
     """
     wide, tall = max(cell_m[:2]), cell_m[2]
     pile = min(max(round(tall / wide), 1), PILE)
@@ -215,7 +202,7 @@ def _whole_blocks(*arrays_V: Array) -> tuple[Array, ...]:
 def _blocks_in_view(
     projected: ProjectedPoints, height: int, width: int, most: int, few: int
 ) -> tuple[Array, Array]:
-    """Return (few,) the blocks that reach into the image, padded with their number; how many do."""
+    """Return (few,) blocks that reach into the image, padded with their number; how many do."""
     # A point reaches half of `most` beyond where it is, and its bilinear share one pixel.
     reach = most / 2 + 1
     across = (projected.u_V > -reach) & (projected.u_V < width + reach)
@@ -236,11 +223,7 @@ def _draw(
     most: int,
     average: bool,
 ) -> tuple[Array, Array, Array]:
-    """Return (H·W, F) features, (H·W,) depth and (H·W,) whether something is seen.
-
-    Points that face away (``away_V``) hide others and are not seen themselves, except where one
-    that does not lies as near.
-    """
+    """Return (H·W, F) features, (H·W,) depth and seen; points in ``away_V`` hide others, unseen."""
     count, pixels = len(features_VF), height * width
     front_P, covering = zbuffer.nearest_per_pixel(projected, height, width, most)
 
@@ -286,11 +269,7 @@ def _shares(
     visible: Callable[[Array, Array], tuple[Array, Array]],
     pixels: int,
 ) -> Array:
-    """Return (H·W, F + 2) sums of the features, depth and 1 of the points around each pixel.
-
-    With ``away_V`` they are of the points that do not face away; the last but one of then F + 3
-    sums counts those that do.
-    """
+    """Return (H·W, F + 2) sums of features, depth, if any the points facing away, and 1."""
     # A place may be computed anew for each use, rounded to either side of the middle of a pixel,
     # where a point that is seen again lies: the border between two pixels is moved from there.
     u, v = projected.u_V - 0.5, projected.v_V - 0.5
@@ -315,17 +294,12 @@ def _shares(
 
 
 def tolerance(depth: Array) -> Array:
-    """Return how far behind the front a point may lie and still be on it, metres."""
+    """Return how far behind the front a point may lie and still belong to it, metres."""
     return jnp.maximum(TOLERANCE_M, TOLERANCE_RELATIVE * depth)
 
 
 def over(front: View, back: View) -> View:
-    """Return the first of two views of the same cameras where it shows anything, else the second.
-
-    Args:
-        front: of T cameras.
-        back: of the same.
-    """
+    """Return the first of two views of the same cameras where it shows anything, else the other."""
     seen = front.seen_THW
     return View(
         jnp.where(seen[..., None], front.features_THWF, back.features_THWF),
@@ -335,16 +309,10 @@ def over(front: View, back: View) -> View:
 
 
 def fill_nearest(view: View) -> View:
-    """Fill pixels that show nothing from the nearest pixel of their image that shows something.
+    """Fill unseen pixels from the nearest seen pixel of their image; ``seen_THW`` is unchanged.
 
-    By jump flooding (steps of …, 4, 2, 1 and once more 1 pixels): a static number of passes, and
-    seldom a pixel that is a little farther than the nearest. Images that show nothing stay empty.
-
-    Args:
-        view: what was seen.
-
-    Returns:
-        The view with features and depth everywhere; ``seen_THW`` still tells what was seen.
+    Jump flooding with steps of …, 4, 2, 1 and 1 pixels takes a static number of passes; seldom the
+    pixel found is a little farther than the nearest. Images without seen pixels stay empty.
     """
     frames, height, width = view.seen_THW.shape
     index, found = depth_images.nearest_known(view.seen_THW)

@@ -66,7 +66,7 @@ class Surfels:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """What is inserted: P points.
+    """P points to insert.
 
     Attributes:
         points_P3: (P, 3) in the world, metres.
@@ -84,14 +84,7 @@ class Points:
 
 
 def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool = True) -> Surfels:
-    """Insert points; new cells beyond the capacity are counted, and what is there stays.
-
-    Args:
-        config: cell size, extent, capacity, what is kept of a cell.
-        surfels: those so far.
-        new: the points.
-        observed: False where they were imagined.
-    """
+    """Insert points, observed or imagined; cells beyond the capacity are counted and dropped."""
     none, capacity = cells.nowhere(config), surfels.cell_V.shape[0]
     cell_P = cells.keys(config, surfels.origin_3, new.points_P3)
     outside = (new.valid_P & (cell_P == none)).sum(dtype=jnp.int32)
@@ -135,10 +128,7 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
 
 
 def means(config: SurfelConfig, surfels: Surfels) -> tuple[Array, Array, Array, Array, Array]:
-    """Return ``(points_world_V3, colours_V3, normals_V3, features_VF, valid_V)``; free slots are 0.
-
-    F is 0 where features are not kept.
-    """
+    """Return (points_V3, colours_V3, normals_V3, features_VF, valid_V); free slots are 0."""
     valid = surfels.cell_V < cells.nowhere(config)
     mean = surfels.sums_VC[:, 1:] / jnp.where(valid, surfels.sums_VC[:, 0], 1)[:, None]
     corner = cells.corners(config, surfels.origin_3, jnp.where(valid, surfels.cell_V, 0))
@@ -154,7 +144,7 @@ def _render(
     height: int,
     width: int,
 ) -> rendering.View:
-    """Draw surfels as wide as they are, those that were observed before those imagined."""
+    """Draw surfels at their width; observed ones cover imagined ones."""
     points, _, normals_V3, _, valid = means(config, surfels)
     turned = jnp.linalg.norm(normals_V3, axis=-1, keepdims=True) >= TURNED
     sides = jnp.where(turned, normals_V3, 0) if config.sides else None
@@ -184,7 +174,7 @@ def _render(
 
 
 def widths(config: SurfelConfig, surfels: Surfels) -> Array:
-    """Return (V,) how wide surfels are, metres: as their cell, or as the pixel that saw them."""
+    """Return (V,) widths of surfels, metres: that of their cell, or of the pixel that saw them."""
     return jnp.maximum(surfels.size_V, max(config.cell_m))
 
 
@@ -193,13 +183,7 @@ COUNT, PLACE, COLOUR, NORMAL = slice(0, 1), slice(1, 4), slice(4, 7), slice(7, 1
 
 
 def _erase(config: SurfelConfig, surfels: Surfels, taken_V: Array) -> Surfels:
-    """Return the surfels without those that are taken.
-
-    Args:
-        config: cell size, extent, capacity.
-        surfels: those so far.
-        taken_V: (V,) bool.
-    """
+    """Return the surfels without those in ``taken_V``."""
     no_cell = cells.nowhere(config)
     cell_V = jnp.sort(jnp.where(taken_V, no_cell, surfels.cell_V))
     return _rearranged(config, surfels, cell_V)
@@ -214,20 +198,7 @@ def _move(
     *,
     leave: bool = False,
 ) -> Surfels:
-    """Return the surfels after those that are taken were moved, or copied.
-
-    Args:
-        config: cell size, extent, capacity.
-        surfels: those so far.
-        points_V3: (V, 3) where they are, metres.
-        taken_V: (V,) bool, those to move.
-        transform: (4, 4) rigid, from old to new positions.
-        leave: leave them where they are, too.
-
-    Returns:
-        The surfels. Cells that do not fit are counted as dropped, surfels that leave the grid as
-        outside.
-    """
+    """Move or copy the surfels in ``taken_V``; those that do not fit or leave are counted."""
     no_cell, capacity = cells.nowhere(config), surfels.cell_V.shape[0]
     there = transform_points(transform, points_V3)
     target = cells.keys(config, surfels.origin_3, there)
@@ -278,7 +249,7 @@ def _rearranged(config: SurfelConfig, surfels: Surfels, cell_V: Array) -> Surfel
 class SurfelConfig(Memory):
     """Small coloured surfaces at the sensor's resolution; cells, tokens and capacity as elsewhere.
 
-    They alone know what was observed and what was imagined: see ``protect``.
+    Only this memory distinguishes observed from imagined content: see ``protect``.
     """
 
     EDITABLE: ClassVar[bool] = True
@@ -349,17 +320,9 @@ class SurfelConfig(Memory):
         *,
         observed: bool = True,
     ) -> Surfels:
-        """Insert every pixel of posed RGB-D frames, colours in [−1, 1].
+        """Insert every pixel of T posed RGB-D frames, the newest last.
 
-        Args:
-            model: the model.
-            params: not used.
-            memory: the surfels so far.
-            frames: T frames, the newest last.
-            features_ThwF: (T, h, w, F) the encoder's; a pixel gets those of the patch it lies in.
-                Not used if features are not kept.
-            valid_T: (T,) bool, False frames are ignored.
-            observed: False if the frames were imagined.
+        A pixel gets the features of the patch it lies in, if features are kept.
         """
         del model, params
         depth_THW = jnp.asarray(frames.depth_THW)
@@ -389,11 +352,7 @@ class SurfelConfig(Memory):
         return insert(self, memory, new, observed)
 
     def to_points(self, model: AssembledModel, memory: Surfels) -> tuple[Array, Array, Array]:
-        """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0.
-
-        Without ``features`` these are the colour, a 1 that marks a surfel, and zeros up to the
-        encoder's channels.
-        """
+        """Return all slots; without ``features``, a point's are its colour, a 1 and zeros."""
         del model
         points, colours, _, features, valid = means(self, memory)
         if self.features:
@@ -427,7 +386,6 @@ class SurfelConfig(Memory):
         """Return surfels without most of the free slots: they render equally and faster.
 
         The capacity is cut to a multiple of an eighth, so that few shapes are compiled.
-        It is read on the host; what is inserted afterwards has that much less room.
         """
         capacity = len(memory.cell_V)
         part = -(-capacity // 8)

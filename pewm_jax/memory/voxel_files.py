@@ -23,12 +23,7 @@ NAMES = {"cells_NI": "int32", "counts_3": "int32", "features_NF": "", "origin_3"
 
 
 def save(config: Memory, voxels: VoxelMap, path: Path) -> None:
-    """Write a map atomically; free slots take no space.
-
-    Args:
-        config: the map's settings; cell size and extent are stored in the file.
-        voxels: one map, not a batch.
-        path: the file, usually ``map.safetensors``; its folder is created.
+    """Write one map atomically, with its cell size and extent; free slots take no space.
 
     Raises:
         UserError: the map is a batch of maps.
@@ -49,12 +44,7 @@ def save(config: Memory, voxels: VoxelMap, path: Path) -> None:
 
 
 def load(config: Memory, path: Path) -> VoxelMap:
-    """Read a map written by ``save``.
-
-    Args:
-        config: cell size and extent must equal the file's; the capacity may differ as long as all
-            cells fit.
-        path: the file.
+    """Read a map written by ``save``; the capacity may differ if all cells fit.
 
     Raises:
         UserError: the file is absent, damaged, not a map, of another grid, or has more cells than

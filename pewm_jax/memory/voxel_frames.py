@@ -28,13 +28,8 @@ WORTH_A_BRANCH = 8192
 def pixel_cells(config: Memory, origin_3: Array, depth_THW: Array, camera: Camera) -> Array:
     """Return (T, H, W) int32, the cell of each pixel's surface point (see ``cells.keys``).
 
-    The result equals unprojecting to points first, but takes one pass and stores no points.
-
-    Args:
-        config: cell size and extent.
-        origin_3: (3,) lower corner of the grid, metres.
-        depth_THW: (T, H, W) depth, metres.
-        camera: (T,) cameras.
+    The result equals unprojecting depth (metres) to points first, but takes one pass and stores no
+    points.
     """
     _, height, width = depth_THW.shape
     fx, fy, cx, cy = (camera.intrinsics_4[:, i, None, None] for i in range(4))
@@ -56,12 +51,8 @@ def pixel_cells(config: Memory, origin_3: Array, depth_THW: Array, camera: Camer
 def corners(cell_THW: Array, square_H: np.ndarray, square_W: np.ndarray) -> Array:
     """Return (T, H, W) bool: pixels that end both their horizontal and their vertical run.
 
-    A run is a sequence of neighbouring pixels of the same cell and the same square.
-
-    Args:
-        cell_THW: (T, H, W) cell of each pixel.
-        square_H: (H,) index of the row of patch centres before each row of pixels.
-        square_W: (W,) index of the column of patch centres before each column of pixels.
+    A run is a sequence of neighbouring pixels of the same cell and the same square: ``square_H``
+    and ``square_W`` are the indices of the patch centres before each row and column of pixels.
     """
     down = (cell_THW[:, 1:] == cell_THW[:, :-1]) & (square_H[1:] == square_H[:-1])[:, None]
     right = (cell_THW[:, :, 1:] == cell_THW[:, :, :-1]) & (square_W[1:] == square_W[:-1])
@@ -76,8 +67,7 @@ def between(pixels: int, patches: int) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         ``(square, share)``: the index of the patch centre at or before each pixel centre, from −1
-        (before the first one) to patches − 1; and the pixel's distance from it, as a share [0, 1)
-        of the distance to the next one.
+        to patches − 1; and the distance from it, as a share [0, 1) of the distance to the next one.
     """
     place = (np.arange(pixels) + 0.5) * patches / pixels - 0.5
     square = np.floor(place)
@@ -85,11 +75,7 @@ def between(pixels: int, patches: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def compact(mask_THW: Array) -> tuple[Array, Array]:
-    """List the True pixels.
-
-    Returns:
-        ``(index_P, count)``: the linear indices of the True pixels, padded with P; their number.
-    """
+    """Return the linear indices of the True pixels, padded with P, and their number."""
     frames, _, width = mask_THW.shape
     size = mask_THW.size
     # Sums run down all columns at once, which is much faster on a CPU than along rows.
@@ -127,7 +113,7 @@ def insert(
     """Insert the upsampled features of pixels into sorted cells.
 
     Args:
-        config: gives the number that stands for no cell.
+        config: the map's settings.
         cell_V: (V,) the cells of the map.
         features_VF: (V, F) their features.
         cell_THW: (T, H, W) the cell of each pixel, ``nowhere`` for pixels to ignore.

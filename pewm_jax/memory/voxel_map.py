@@ -1,25 +1,22 @@
 """The 3D voxel feature map: sparse, of static capacity, filled by scatter-max (the paper's memory).
 
-The feature of a cell is the maximum over all points that ever fell into it. Order, batching and
-repetition of points do not matter: as long as everything fits, maps of the same points are equal
-bit for bit. Cells are initialized with −inf, not 0, so negative features survive and an unobserved
-cell differs from a cell with feature 0. Only *occupied* cells take memory (``cells``).
+The feature of a cell is the maximum over all points that ever fell into it. While everything fits,
+maps of the same points are equal bit for bit, in any order or batching of the insertions. Cells are
+initialized with −inf, so negative features survive. Only *occupied* cells take memory (``cells``).
 
 Cells that do not fit are counted in ``dropped``, once per insertion that saw them, and points
-outside the grid in ``outside``. The choice of cells is deterministic: cells of earlier insertions
-stay, and within one insertion lower cell numbers have precedence.
+outside the grid in ``outside``. Cells of earlier insertions stay; within one insertion lower cell
+numbers have precedence.
 
-All functions from maps to maps are pure. They work under jit (``config`` is static) and vmap, with
-donated maps, and with a batch of maps sharded over devices. Maps can be edited in metres::
+All functions from maps to maps are pure and work under jit (``config``, with cell size, extent and
+capacity, is static) and vmap. A box is (2, 3), its lower and upper corner in metres; a cell belongs
+to it if its centre lies in it::
 
     voxels = empty(config, centre, channels)
     voxels = insert_frames(config, voxels, frames, patch_features)
-    chair = copy(config, voxels, box)                    # (2, 3) corners, metres
+    chair = copy(config, voxels, box)
     voxels = move(config, voxels, box, transform)
     export(config, voxels, "map.glb")
-
-A cell belongs to a box if its centre lies in it. The world model imagines what the map contains, so
-moving a part of the map moves that part of the world.
 """
 
 from __future__ import annotations
@@ -65,14 +62,10 @@ __all__ = [
 def empty(
     config: Memory, centre_3: Array, channels: int, dtype: DTypeLike = jnp.float32
 ) -> VoxelMap:
-    """Return an empty map.
+    """Return an empty map of F = ``channels`` features per cell, float32 or bfloat16.
 
-    Args:
-        config: cell size, extent, capacity.
-        centre_3: (3,) world position the grid is centred on, metres; the grid's corner is
-            snapped to whole cells so that maps of one world share their cells.
-        channels: features F per cell.
-        dtype: dtype of the features, float32 or bfloat16.
+    The grid is centred on a world position (3,), metres. Its corner is snapped to whole cells, so
+    that maps of one world share their cells.
     """
     zero = jnp.zeros((), jnp.int32)
     return VoxelMap(
@@ -88,17 +81,9 @@ def empty(
 def insert(
     config: Memory, voxels: VoxelMap, points_P3: Array, features_PF: Array, valid_P: Array
 ) -> VoxelMap:
-    """Insert points by scatter-max.
+    """Insert (P, 3) world points with (P, F) features by scatter-max, where ``valid_P`` is True.
 
-    Args:
-        config: cell size, extent, capacity.
-        voxels: the map.
-        points_P3: (P, 3) world points, metres; NaN counts as outside the grid.
-        features_PF: (P, F) their features, rounded to the map's dtype.
-        valid_P: (P,) bool; False points are ignored.
-
-    Returns:
-        The map after the insertion.
+    Points with NaN count as outside the grid. Features are rounded to the map's dtype.
 
     Raises:
         UserError: points, features, validity and the map's channels do not fit together.
@@ -142,9 +127,9 @@ def insert_frames(
     rounding of the interpolation. The upsampled features are never stored (see ``voxel_frames``).
 
     Args:
-        config: cell size, extent, capacity.
+        config: the map's settings.
         voxels: the map.
-        frames: T frames; depth and cameras are used, and pixels without depth are ignored.
+        frames: T frames; pixels without depth are ignored.
         features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame, float32
             or bfloat16; they are upsampled bilinearly in float32, patch centres at half-integers.
         valid_T: (T,) bool, False frames are ignored.
@@ -176,14 +161,10 @@ def insert_frames(
 def merge(config: Memory, a: VoxelMap, b: VoxelMap) -> VoxelMap:
     """Return the union of two maps of one world: the maximum where both have a cell.
 
-    As long as everything fits, merging equals inserting the points of both into one map. Counts of
-    dropped cells and of points outside are added.
-
-    Args:
-        config: cell size, extent, capacity of both.
-        a: a map; its grid is kept, and its cells have precedence where the capacity is full.
-        b: a map whose grid is equal to a's or shifted by whole cells; its cells outside a's grid
-            are counted as outside, once per cell.
+    While everything fits, merging equals inserting the points of both into one map. The grid of
+    ``a`` is kept, and its cells have precedence where the capacity is full; cells of ``b`` outside
+    it are counted as outside, once per cell. Counts of dropped cells and of points outside are
+    added.
 
     Raises:
         UserError: the grids are not shifted by whole cells (not checked under jit).
@@ -215,17 +196,11 @@ def to_points(config: Memory, voxels: VoxelMap) -> tuple[Array, Array, Array]:
 
 
 def tokens(config: Memory, voxels: VoxelMap, camera: Camera, size: tuple[int, int]) -> MapTokens:
-    """Choose the M = ``memory.tokens`` cells that condition one clip.
+    """Choose the M = ``memory.tokens`` cells that condition one clip of (T,) cameras.
 
-    Cells that the clip's cameras can see come first (``cells.choose``). Ties go to the lower cell
-    number. With fewer than M occupied cells, the remaining tokens are masked. Positions
-    are in the world; ``readers.geometry`` encodes them for attention.
-
-    Args:
-        config: gives M.
-        voxels: the map.
-        camera: (T,) cameras of the clip.
-        size: image height and width in pixels.
+    Cells that the cameras can see come first (``cells.choose``); ties go to the lower cell number.
+    With fewer than M occupied cells, the remaining tokens are masked. ``size`` is the image's
+    height and width in pixels.
     """
     points, features, valid = to_points(config, voxels)
     order = cells.choose(config, points, valid, camera, size)
@@ -276,15 +251,10 @@ def export(
 
 
 def erase(config: Memory, voxels: VoxelMap, box_23: Array) -> VoxelMap:
-    """Forget the cells in a box, as if nothing had ever been seen there.
-
-    Args:
-        config: cell size, extent, capacity.
-        voxels: the map.
-        box_23: (2, 3) lower and upper corner in the world, metres.
+    """Erase the cells in a box, as if nothing had ever been observed there.
 
     Raises:
-        UserError: the box is not a box.
+        UserError: the box is invalid.
     """
     return _only(config, voxels, ~_within(config, voxels, box_23))
 
@@ -292,13 +262,8 @@ def erase(config: Memory, voxels: VoxelMap, box_23: Array) -> VoxelMap:
 def copy(config: Memory, voxels: VoxelMap, box_23: Array) -> VoxelMap:
     """Return a map of only the cells in a box; its counts of dropped and outside are 0.
 
-    Args:
-        config: cell size, extent, capacity.
-        voxels: the map.
-        box_23: (2, 3) lower and upper corner in the world, metres.
-
     Raises:
-        UserError: the box is not a box.
+        UserError: the box is invalid.
     """
     piece = _only(config, voxels, _within(config, voxels, box_23))
     zero = jnp.zeros((), jnp.int32)
@@ -312,17 +277,14 @@ def paste(
 
     Each cell of the map takes the cell of the piece that its centre comes from (inverse warping),
     so a rotated piece has no holes and does not grow. Quarter turns and shifts by whole cells are
-    exact.
+    exact. Cells that do not fit are counted as dropped, and cells whose centre leaves the grid as
+    outside.
 
     Args:
-        config: cell size, extent, capacity of both.
+        config: settings of both.
         voxels: the map; its cells have precedence where the capacity is full.
         piece: from ``copy``, or any map of the same cell size.
         transform: (4, 4) rigid, metres; None for the identity.
-
-    Returns:
-        The map. Cells that do not fit are counted as dropped; cells of the piece whose centre
-        leaves the grid are counted as outside.
 
     Raises:
         UserError: the transform is not a rigid 4×4.
@@ -363,17 +325,12 @@ def move(
     *,
     leave: bool = False,
 ) -> VoxelMap:
-    """Move what is in a box: copy it, erase it, paste it elsewhere.
+    """Move what is in a box by a rigid (4, 4) transform: copy, erase, paste.
 
-    Args:
-        config: cell size, extent, capacity.
-        voxels: the map.
-        box_23: (2, 3) lower and upper corner in the world, metres.
-        transform: (4, 4) rigid, from old to new positions, metres.
-        leave: erase nothing: a copy.
+    With ``leave`` the content also stays in place.
 
     Raises:
-        UserError: the box is not a box, or the transform not a rigid 4×4.
+        UserError: the box is invalid, or the transform is not a rigid 4×4.
     """
     piece = copy(config, voxels, box_23)
     rest = voxels if leave else erase(config, voxels, box_23)
@@ -407,7 +364,7 @@ class VoxelConfig(Memory):
     EDITABLE: ClassVar[bool] = True
 
     def empty(self, model: AssembledModel, centre_3: Array) -> VoxelMap:
-        """Return an empty map with a grid centred on a world position."""
+        """Return an empty map."""
         del model
         return empty(self, centre_3, self.encoder.channels)
 
@@ -424,19 +381,19 @@ class VoxelConfig(Memory):
     ) -> VoxelMap:
         """Insert the pixels of frames; see ``insert_frames``."""
         del model, params, observed
-        return insert_frames(self, memory, frames, features_ThwF, valid_T)
+        return insert_frames(self.grid, memory, frames, features_ThwF, valid_T)
 
     def read(self, model: AssembledModel, memory: VoxelMap, camera: Camera) -> MapTokens:
         """Choose the cells that condition one clip; see ``tokens``."""
-        return tokens(self, memory, camera, (model.clip.height, model.clip.width))
+        return tokens(self.grid, memory, camera, (model.clip.height, model.clip.width))
 
     def to_points(self, model: AssembledModel, memory: VoxelMap) -> tuple[Array, Array, Array]:
         """Return centre, features and validity of all slots."""
         del model
-        return to_points(self, memory)
+        return to_points(self.grid, memory)
 
     def erase(self, model: AssembledModel, memory: VoxelMap, box_23: Array) -> VoxelMap:
-        """Forget a box; see ``erase``."""
+        """Erase a box; see ``erase``."""
         del model
         return erase(self, memory, box_23)
 
@@ -452,3 +409,32 @@ class VoxelConfig(Memory):
         """Move or copy the content of a box; see ``move``."""
         del model
         return move(self, memory, box_23, transform, leave=leave)
+
+
+@dataclasses.dataclass(frozen=True)
+class Map2DConfig(VoxelConfig):
+    """The feature map seen from above: a cell reaches from the floor to the ceiling.
+
+    The baseline "2D map" of the paper's Table 1: a voxel map with one layer. Its tokens are at the
+    height of the grid's centre.
+    """
+
+    EDITABLE: ClassVar[bool] = False
+    erase = Memory.erase
+    move = Memory.move
+
+    @property
+    def grid(self) -> Map2DConfig:
+        """The settings of the voxel map with one layer."""
+        (x, y, z), (nx, ny, nz) = self.cell_m, self.cells
+        return dataclasses.replace(self, cell_m=(x, y, z * nz), cells=(nx, ny, 1))
+
+    def empty(self, model: AssembledModel, centre_3: Array) -> VoxelMap:
+        """Return an empty map whose layer is centred exactly on the given height.
+
+        Snapped to multiples of the cell's height, the layer could miss the room.
+        """
+        del model
+        voxels = empty(self.grid, centre_3, self.encoder.channels)
+        bottom = jnp.asarray(centre_3, jnp.float32)[2] - self.grid.cell_m[2] / 2
+        return dataclasses.replace(voxels, origin_3=voxels.origin_3.at[2].set(bottom))

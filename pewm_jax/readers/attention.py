@@ -49,7 +49,7 @@ SINUSOID = 60
 
 
 def token_channels(model: AssembledModel) -> int:
-    """Return the channels of a map token: its features and, if sinusoidal, its position."""
+    """Return the channels of a map token: features and, if sinusoidal, its position."""
     positions = SINUSOID if _settings(model).positions == "sinusoid" else 0
     return model.memory.encoder.channels + positions
 
@@ -65,7 +65,7 @@ def _ray_channels(model: AssembledModel) -> int:
 
 
 def _embeddings(model: AssembledModel) -> tuple[modules.nn.Dense, modules.nn.Dense]:
-    """Return the linear layers that embed rays (one vector per video token) and map tokens."""
+    """Return the linear layers of rays (one vector per video token) and map tokens."""
     dtype = jnp.dtype(model.dtype)
     camera = modules.dense(model.backbone.places.width // 2, dtype, "camera")
     # A layer norm follows, which would discard the magnitude of the features. A random bias of
@@ -164,7 +164,7 @@ class AttentionConfig(Reader):
         camera: Camera,
         rays_BthwC: Array,
     ) -> Readers:
-        """Embed rays and map tokens, and select the tokens each camera attends to."""
+        """Embed rays and map tokens, and select the tokens that each camera attends to."""
         places, dtype = model.backbone.places, jnp.dtype(model.dtype)
         missing = -rays_BthwC.shape[1] % places.patch_t
         rays = jnp.concatenate([rays_BthwC[:, :1]] * missing + [rays_BthwC], 1).astype(dtype)

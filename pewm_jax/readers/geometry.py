@@ -1,7 +1,5 @@
 """Positions of remembered cells for memory attention.
 
-Two schemes:
-
 * ``sinusoid`` (the paper): a 3D sinusoid of the cell's position, concatenated to its features. The
   position is relative to the clip's first camera or, with ``frame`` world, absolute.
 * ``projective``: every cell is projected into the camera of every frame. Keys get a rotary
@@ -39,10 +37,9 @@ NEAREST_M = 0.05
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Sightings:
-    """Map tokens as seen by the cameras of a clip.
+    """Map tokens in view of the cameras of a clip.
 
-    Below, t counts tokens in time, and q the cameras of one token: those of its ``patch_t`` latent
-    frames.
+    t counts tokens in time, and q the cameras of one token: those of its ``patch_t`` latent frames.
 
     Attributes:
         index_tqJ: (B, t, q, J) int32, which of the M map tokens each camera attends to.
@@ -107,9 +104,9 @@ def sightings(
 ) -> Sightings:
     """Choose the map tokens that each camera attends to, and compute their positions.
 
-    Each camera gets J = ``looks`` tokens in view: first those that it can see, every part of its
-    image in turn (``geometry.zbuffer``; not with ``memory.choose`` nearest), then the nearest.
-    Tokens hidden behind much nearer ones come last.
+    Each camera gets J = ``looks`` tokens in view: first visible ones, every part of its image in
+    turn (``geometry.zbuffer``; not with ``memory.choose`` nearest), then the nearest. Tokens behind
+    much nearer ones come last.
 
     Args:
         model: the model.
@@ -163,23 +160,17 @@ def _look(
 
 
 def _turns(model: AssembledModel, points_M3: Array, valid_M: Array, camera: Camera) -> Array:
-    """Return (T, M) how early each camera names each token; see ``zbuffer.visibility_rank``."""
+    """Return (T, M) the rank of each token for each camera; see ``zbuffer.visibility_rank``."""
     cell_m, size = model.memory.cell_m, (model.clip.height, model.clip.width)
     wide, tall = jnp.float32(max(cell_m[:2])), jnp.float32(cell_m[2])
     return zbuffer.visibility_rank(points_M3, wide, tall, valid_M, camera, size)
 
 
 def sinusoid_3d(model: AssembledModel, config: Any, camera: Camera, points_M3: Array) -> Array:
-    """Return (B, M, 6·10) sines and cosines of the positions of map tokens.
+    """Return (B, M, 6·10) sines and cosines of (B, M, 3) positions, metres.
 
     The 10 wavelengths grow geometrically from 4 × a cell's smallest side to 4 × the map's largest
-    extent.
-
-    Args:
-        model: the model; its memory gives cell size and extent.
-        config: the reader; ``frame`` is the origin of positions.
-        camera: (B, T) cameras of the clips.
-        points_M3: (B, M, 3) world points, metres.
+    extent. With ``config.frame`` camera, positions are relative to the first of the (B, T) cameras.
     """
     local = points_M3
     if config.frame == "camera":

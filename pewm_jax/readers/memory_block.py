@@ -1,4 +1,4 @@
-"""The memory expert block: how the denoiser reads the map (paper, Eq. 2 and Fig. 2).
+"""The memory expert block, by which the denoiser reads the map (paper, Eq. 2 and Fig. 2).
 
 ``concat(H, camera embedding)`` and the map tokens M each get an adaptive layernorm from the time
 embedding. H attends to M. α_M gates the attention, α_H the feed-forward network:
@@ -41,8 +41,8 @@ def masked_attention(logits: Array, mask: Array, sink_K: Array, values: Array) -
     """Attend to unmasked tokens, or to none.
 
     The softmax over the last axis has one extra entry per head whose value is zero (the sink). A
-    query may attend to it instead of to tokens, and if all tokens are masked the result is zero,
-    never NaN.
+    query may attend to it instead of to tokens; if all tokens are masked the result is zero, never
+    NaN.
 
     Args:
         logits: (..., K, n, M) float32.
@@ -157,14 +157,9 @@ def _read_seen(
 ) -> Array:
     """Return the attention over the tokens in view of each frame's cameras, on one device.
 
-    Args:
-        q: (B, K, t·n, d) queries, normalised, without position.
-        k: (B, K, M, d) keys, normalised, without position.
-        v: (B, K, M, d) values.
-        views: index, angles, position and visibility of the J tokens in view of each head in
-            each frame, (B, t, K, J, …).
-        turns_nR: (n, d/2) rotary angles of the n patches of a frame.
-        learned: the parameters ``q_constant``, ``k_constant``, ``k_depth``, ``nearer``, ``sink``.
+    q is (B, K, t·n, d), k and v are (B, K, M, d), normalised and without position; views are (B, t,
+    K, J, …) index, angles, position and visibility; ``turns_nR`` are the angles of a frame's n
+    patches.
     """
     index, angles, place, visible = views
     q_constant, k_constant, k_depth, nearer, sink = learned
@@ -206,12 +201,12 @@ class MemoryBlock(nn.Module):
         valid_BM: Array,
         seen: Sightings | None,
     ) -> Array:
-        """Update the video tokens with what the map holds.
+        """Update the video tokens with the content of the map.
 
         Args:
             video_BND: (B, N, D) hidden states H.
-            time_BE: (B, E) time embedding, or (B, t, E), one for each token in time (map tokens
-                get their mean).
+            time_BE: (B, E) time embedding, or (B, t, E), one for each token in time (map tokens get
+                their mean).
             camera_BNC: (B, N, C) camera embedding of each video token.
             memory_BMD: (B, M, Dm) embedded map tokens.
             valid_BM: (B, M) bool, False tokens contribute nothing.

@@ -1,15 +1,14 @@
-"""Rendering as a memory reader: each frame's tokens get what the memory looks like from there.
+"""Rendering as a memory reader: each frame's tokens get the memory rendered for its camera.
 
-The memory's pictures (``view`` of a ``MemoryReadout``) are gathered into the cells of the latents
-by space-to-depth and are not encoded. Each video token gets the pixels that it stands for: colours
-or features, depth and a mask. Or, where ``picture`` is `latents`, it gets the latents that the
-codec makes of the pictures (``encoded``), 0 in cells of which nothing is seen, and the mask. Either
-is added to the embedded tokens through a layer that starts at zero, and given to a block without
-attention after every block of the backbone (``render_block``), by which a frozen backbone learns to
-use it. A fresh reader changes nothing, and one that sees nothing never does.
+The rendered views (``view`` of a ``MemoryReadout``) are folded into the cells of the latents by
+space-to-depth without encoding. Each video token gets its pixels: colours or features, depth and a
+mask. Or, with ``picture`` `latents`, it gets the codec's latents of the views (``encoded``), 0 in
+unseen cells, and the mask. Either is added to the embedded tokens through a layer that starts at
+zero, and given to a block without attention after every block of the backbone (``RenderBlock``), by
+which a frozen backbone learns to use it. A fresh reader, or an empty view, changes nothing.
 
-Parameters, under ``render``: ``reduce`` (pictures of many channels), ``embed_1``, ``embed_2``,
-``added``, and the stacked ``blocks``.
+Parameters, under ``render``: ``reduce`` (views of many channels), ``embed_1``, ``embed_2``,
+``added``, and the stacked ``blocks``. The reader ``both`` has these and those of the attention.
 """
 
 from __future__ import annotations
@@ -31,11 +30,12 @@ from pewm_jax.errors import require, require_positive
 from pewm_jax.models.interface import Readers
 from pewm_jax.nn import layers, modules, placement
 from pewm_jax.nn.tokens import TokenLayout, patchify, text_tokens, video_tokens
+from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.types import Array, Camera, MemoryReadout, Params, View
 
 
 class RenderBlock(nn.Module):
-    """Adds to video tokens what a rendered memory shows at their place; no attention."""
+    """Adds the rendered memory to the video tokens of the same pixels; no attention."""
 
     mlp_ratio: int
     """Hidden channels over the tokens' width."""
@@ -44,12 +44,9 @@ class RenderBlock(nn.Module):
 
     @nn.compact
     def __call__(self, video_BND: Array, time_BE: Array, picture_BNW: Array) -> Array:
-        """Return the updated video tokens.
+        """Return the updated video tokens (B, N, D) for the embedded view (B, N, W) at each token.
 
-        Args:
-            video_BND: (B, N, D) hidden states H.
-            time_BE: (B, E) time embedding, or (B, t, E), one for each token in time.
-            picture_BNW: (B, N, W) the embedded part of the picture at each token.
+        The time embedding is (B, E), or (B, t, E), one for each token in time.
         """
         dtype, width = video_BND.dtype, video_BND.shape[-1]
         modulation = modules.dense(3 * width, dtype, "linear", zero=True)(nn.silu(time_BE))
@@ -87,12 +84,12 @@ def _reduces(model: AssembledModel) -> bool:
 
 
 def pixel_channels(model: AssembledModel) -> int:
-    """Return the channels of a pixel of the pictures: features, depth and mask."""
+    """Return the channels of a pixel of the views: features, depth and mask."""
     return min(model.memory.rendered_channels, _settings(model).reduced) + 2
 
 
 def cell_channels(model: AssembledModel) -> int:
-    """Return the channels of what is read at a cell of the latents; see ``cells``."""
+    """Return the channels of the input of one latent cell; see ``cells``."""
     codec = model.codec
     pixels = codec.temporal * codec.spatial**2
     latents = _settings(model).READS_LATENTS
@@ -100,13 +97,13 @@ def cell_channels(model: AssembledModel) -> int:
 
 
 def token_channels(model: AssembledModel) -> int:
-    """Return the channels of the part of the pictures that one video token stands for."""
+    """Return the channels of the part of the views that belongs to one video token."""
     places = model.backbone.places
     return cell_channels(model) * places.patch_t * places.patch**2
 
 
 def _embeddings(model: AssembledModel) -> dict[str, modules.nn.Dense]:
-    """Return the linear layers on the way from pictures to tokens, by name."""
+    """Return the linear layers between views and tokens, by name."""
     config, dtype = _settings(model), jnp.dtype(model.dtype)
     found = {"embed_1": config.picture_width, "embed_2": config.picture_width}
     made = {name: modules.dense(width, dtype, name) for name, width in found.items()}
@@ -117,14 +114,10 @@ def _embeddings(model: AssembledModel) -> dict[str, modules.nn.Dense]:
 
 
 def pictures(model: AssembledModel, params: Params, view: View) -> Array:
-    """Return (B, T, H, W, C) what is read of pictures: features where seen, depth, the mask.
+    """Return (B, T, H, W, C) the input of each pixel: features where seen, depth, the mask.
 
-    Depth is also read where only the back of something is known, a wall of the room next door.
-
-    Args:
-        model: the model.
-        params: the reader's parameters under ``render``.
-        view: (B, T) pictures; features that they hold where nothing is seen are not read.
+    Depth is also used where only the back of a surface is known. ``params`` are those under
+    ``render``.
     """
     seen, dtype = view.seen_THW[..., None], jnp.dtype(model.dtype)
     features: Array = jnp.where(seen, view.features_THWF, 0).astype(dtype)
@@ -136,12 +129,7 @@ def pictures(model: AssembledModel, params: Params, view: View) -> Array:
 
 
 def cells(model: AssembledModel, params: Params, readout: MemoryReadout) -> tuple[Array, Array]:
-    """Return what is read at each cell of the latents, and which clips see anything.
-
-    Args:
-        model: the model.
-        params: the reader's parameters under ``render``.
-        readout: of a batch; what it holds where nothing is seen is not read.
+    """Return the input of each cell of the latents, and the clips that see anything.
 
     Returns:
         ``(cells_BthwC, seen_B)``: the pixels of each cell (see ``pictures``), or its latents and
@@ -161,13 +149,13 @@ def cells(model: AssembledModel, params: Params, readout: MemoryReadout) -> tupl
 
 
 def _apply(model: AssembledModel, params: Params, name: str, x: Array) -> Array:
-    """Apply one of the layers on the way from pictures to tokens."""
+    """Apply one of the layers between views and tokens."""
     return _embeddings(model)[name].apply({"params": params[name]}, x)
 
 
 @dataclasses.dataclass(frozen=True)
 class RenderConfig(Reader):
-    """What the memory looks like from each frame's camera, given to the video tokens there."""
+    """The memory rendered for each frame's camera, added to the video tokens of the same pixels."""
 
     SHARDING: ClassVar[Rules] = _RULES
 
@@ -189,11 +177,11 @@ class RenderConfig(Reader):
 
     @property
     def READS_LATENTS(self) -> bool:  # noqa: N802  # type: ignore[override]
-        """Whether it takes the picture as the codec encodes it."""
+        """Whether it takes the view as latents of the codec."""
         return self.picture == "latents"
 
     def check(self, model: Any) -> None:
-        """Refuse clips that cannot be folded as the pictures are, and latents of features."""
+        """Refuse clips that cannot be folded as the views are, and latents of features."""
         clip, q = model.clip, model.codec.temporal
         require(
             (clip.frames - 1) % q == 0,
@@ -239,7 +227,7 @@ class RenderConfig(Reader):
         camera: Camera,
         rays_BthwC: Array,
     ) -> Readers:
-        """Embed the memory's pictures; see ``readers``."""
+        """Embed the memory's views."""
         del camera, rays_BthwC  # the pictures are what these cameras see
         places, weights = model.backbone.places, params["render"]
         embed = functools.partial(_apply, model, weights)
@@ -271,3 +259,51 @@ class RenderConfig(Reader):
             self.picture in ("pixels", "latents"),
             f"memory.reader.picture is {self.picture!r}; choose pixels or latents.",
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class BothConfig(AttentionConfig, RenderConfig):
+    """Cross-attention, then rendering, at every injection point."""
+
+    SHARDING: ClassVar[Rules] = (*AttentionConfig.SHARDING, *RenderConfig.SHARDING)
+
+    READS_TOKENS: ClassVar[bool] = True
+    READS_VIEW: ClassVar[bool] = True
+
+    def init(self, model: AssembledModel, key: Array) -> Params:
+        """Return random parameters of both; the attention's are those that it has alone."""
+        rendering = RenderConfig.init(self, model, jax.random.fold_in(key, 1))
+        return {**AttentionConfig.init(self, model, key), **rendering}
+
+    def prepare(
+        self,
+        model: AssembledModel,
+        params: Params,
+        readout: MemoryReadout,
+        camera: Camera,
+        rays_BthwC: Array,
+    ) -> Readers:
+        """Prepare both."""
+        attend = AttentionConfig.prepare(self, model, params, readout, camera, rays_BthwC)
+        render = RenderConfig.prepare(self, model, params, readout, camera, rays_BthwC)
+        if render.block is None:
+            return dataclasses.replace(attend, added_BND=render.added_BND)
+
+        def read(layer: Params, video: Array, time: Array) -> Array:
+            assert attend.block is not None
+            assert render.block is not None
+            video = attend.block(layer["attend"], video, time)
+            return render.block(layer["render"], video, time)
+
+        stacked = {"attend": attend.params, "render": render.params}
+        return Readers(read, stacked, render.added_BND)
+
+    def check(self, model: Any) -> None:
+        """Refuse what either of the two refuses."""
+        AttentionConfig.check(self, model)
+        RenderConfig.check(self, model)
+
+    def __post_init__(self):
+        """Validate."""
+        AttentionConfig.__post_init__(self)
+        RenderConfig.__post_init__(self)

@@ -19,11 +19,10 @@ import jax
 from pewm_jax.config import Config, Memory, Reader, UserError
 from pewm_jax.encoders.latents import LatentsConfig
 from pewm_jax.memory.images import ImagesConfig
-from pewm_jax.memory.map2d import Map2DConfig
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.points import PointsConfig
 from pewm_jax.memory.surfels import SurfelConfig
-from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.memory.voxel_map import Map2DConfig, VoxelConfig
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig

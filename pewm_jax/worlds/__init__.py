@@ -1,27 +1,26 @@
 """Worlds: start from frames, observe frames, imagine frames.
 
-Every world has the same three functions. They are pure. Called
-eagerly, they check the values they are given and run a program that is compiled once for each model
-and each set of shapes. They can also be called under jit (with the model static), vmap and grad. ::
+Every world has the same pure functions. Called eagerly, they check the values they are given and
+run a program that is compiled once for each model and each set of shapes. They can also be called
+under jit (with the model static), vmap and grad. ::
 
     state = start(model, params, frames)                        # a few posed RGB-D frames
     state = observe(model, params, state, frames)               # more real frames, later
-    state, frames = imagine(model, params, state, control, key) # what will be seen
+    state, frames = imagine(model, params, state, control, key) # the frames that will be seen
     state, frames = imagine_many(model, params, state, controls, keys)  # many candidates
 
 ``imagine_many`` compares candidates without copying the memory. ``jax.vmap`` of ``imagine`` over
-controls copies it only if each result has a memory of its own; to share it, say that the state is
-not batched, neither on the way in nor on the way out::
+controls copies it unless the state is declared as not batched in both directions::
 
     one = functools.partial(imagine, model, params, remember=False)
     shared = WorldState(0, None)  # the frame has the axis, the memory has none
     many = jax.vmap(one, in_axes=(None, 0, 0), out_axes=(shared, 0))
 
-``jax.vmap`` over *states* is for worlds that differ; it needs one memory for each.
+``jax.vmap`` over *states* is for different worlds and needs one memory for each.
 
 A world is a class derived from ``pewm_jax.config.World``; a training task that imagines nothing (a
 codec, a policy) is derived from ``pewm_jax.config.Task``. ``examples/world.py`` is a whole world in
-one file, ``worlds.pewm`` the paper's.
+one file.
 """
 
 from __future__ import annotations
@@ -40,19 +39,19 @@ from pewm_jax.worlds.stages import Stage
 
 
 def model_of(config: Any) -> Any:
-    """Return the model's settings, from a whole experiment's if those are given."""
+    """Return the settings of a model, also from those of a whole experiment."""
     return config.model if isinstance(config, Config) else config
 
 
 def require_world(model: Task, who: str) -> World:
-    """Return the settings of a world, or refuse those of a task that imagines nothing.
+    """Return the settings of a world, or refuse a training task that imagines nothing.
 
     Args:
         model: the settings.
-        who: what asks for a world, for the message: ``"start()"``.
+        who: the function that needs a world, for the message: ``"start()"``.
 
     Raises:
-        UserError: it is a training task alone.
+        UserError: it is a training task alone, or its capabilities are invalid.
     """
     if not isinstance(model, World):
         raise UserError(f"{who} got a run that {model.INSTEAD}.")
@@ -70,15 +69,12 @@ def start(
 
     Args:
         model: the model's settings, or an experiment's, which contain them.
-        params: the world model's parameters; those of the image encoder are used, if it has any.
+        params: the world model's parameters.
         frames: S ≥ 1 frames (S, H, W, …); all are remembered, the last one is the present. Colours
             are uint8, or floats in [−1, 1]; depth is float metres along z, 0 where nothing was
             measured; intrinsics are in pixels of these images; poses are rigid.
         depth_scale: metres per unit of depth, required where depth is integers: 0.001 for
             millimetres. Values of 65535 in uint16 then count as not measured.
-
-    Returns:
-        The state to imagine from.
 
     Raises:
         UserError: the frames' shapes do not agree with each other or with the model, or their
@@ -99,17 +95,10 @@ def observe(
     *,
     depth_scale: float | None = None,
 ) -> WorldState:
-    """Remember real frames; the last one becomes the present.
+    """Remember S ≥ 1 real frames; the last one becomes the present. Arguments as for ``start``.
 
     A state that an invalid control has turned into NaN (see ``imagine``) stays NaN: observe from
     the state before.
-
-    Args:
-        model: as for ``start``.
-        params: the world model's parameters.
-        state: the world so far.
-        frames: S ≥ 1 frames, as for ``start``.
-        depth_scale: as for ``start``.
 
     Raises:
         UserError: as for ``start``.
@@ -130,7 +119,7 @@ def imagine(
     remember: bool = True,
     memory: bool = True,
 ) -> tuple[WorldState, Frames]:
-    """Imagine what will be seen.
+    """Imagine the frames that a control leads to.
 
     Args:
         model: as for ``start``; static under jit.
@@ -141,9 +130,8 @@ def imagine(
             counter-clockwise); a ``Camera`` (n,) for the frames to imagine (six degrees of
             freedom); or a ``Control`` with (n,) cameras and (n, A) actions.
         key: randomness of the sampling noise.
-        remember: whether the imagined frames are remembered. If not, the state keeps the memory
-            that it had; ``imagine_many`` uses this to compare many controls.
-        memory: False ignores what is remembered (the empty-memory baseline).
+        remember: whether the imagined frames enter the memory.
+        memory: False ignores the memory (the empty-memory baseline).
 
     Returns:
         ``(state, frames)``: the world after the last frame, and the n imagined frames, colours
@@ -152,8 +140,8 @@ def imagine(
 
         Under jit, vmap and grad the values of a control cannot be refused. If any of its actions is
         unknown, or any number is not finite, then colours, depth and poses of all n frames and of
-        the state's present frame are NaN, and the memory is the one before the call. Whatever is
-        imagined from that state is NaN, too.
+        the state's present frame are NaN, and the memory is the one before the call. Frames that
+        are imagined from that state are NaN, too.
 
     Raises:
         UserError: the control is empty or has none of these forms; model, params, state or key
@@ -189,8 +177,8 @@ def imagine_many(
         controls: as for ``imagine``, with a leading axis K.
         keys: (K,) randomness of each candidate; equal keys give equal noise.
         memory: see ``imagine``.
-        last: give only the last frame of each, (K, 1); a world may then leave the others undecoded.
-        views: what ``views(…)(controls)`` gave for these controls, if it was asked.
+        last: return only the last frame of each, (K, 1); a world may then leave others undecoded.
+        views: the result of ``views(…)(controls)`` for these controls, if it was computed.
 
     Returns:
         ``(state, frames)``: K present frames with the shared memory, which is not copied, and
@@ -305,8 +293,7 @@ def to_compare(model: Config | Task, state: WorldState) -> WorldState:
 def views(model: Config | Task, params: Params, state: WorldState) -> Callable[[Any], Any] | None:
     """Return a function from controls to ``imagine_many``'s ``views``, with a cache of renderings.
 
-    On the host, not under jit; None where candidates have no views to share. The state is the one
-    that candidates are compared from.
+    It runs on the host, not under jit, for candidates of this state; None if they share no views.
     """
     model = require_world(model_of(model), "views()")
     return model.views(forms.own(model, params), state)

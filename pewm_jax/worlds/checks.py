@@ -2,7 +2,8 @@
 
 Shapes and dtypes are always checked. Values are checked where they are known: not under ``jit``,
 ``vmap`` and ``grad``, which trace them. There, ``valid`` and ``poisoned`` turn the result of an
-invalid control into NaN.
+invalid control into NaN. All functions raise ``UserError``; ``who`` is the function that was
+called.
 """
 
 from __future__ import annotations
@@ -34,34 +35,26 @@ NO_MEASUREMENT_16 = 65535
 """Value of 16-bit depth images where nothing was measured, as 0 is."""
 
 
+def _refusal(who: str, got: str, give: str) -> UserError:
+    return UserError(f"{who}() got {got}; give {give}.")
+
+
 def check_frames(frames: Any, who: str, depth_scale: float | None = None) -> Frames:
-    """Return frames as arrays, or refuse those that no camera can have taken.
+    """Return S posed RGB-D frames as arrays, or refuse those that no camera can have taken.
 
-    Frames whose shapes do not agree are returned as they are: the world refuses them.
-
-    Args:
-        frames: S posed RGB-D frames; see ``worlds.start``.
-        who: the function that was called, for the message.
-        depth_scale: metres per unit of depth.
-
-    Raises:
-        UserError: colours that are no uint8 or floats in [−1, 1], integer depth without a scale,
-            depth that is negative or not finite, poses that are not finite or not rigid, or
-            intrinsics that do not fit the size of the images.
+    ``worlds.start`` documents what is refused. Frames whose shapes do not agree are returned as
+    they are: ``require_frames`` refuses them. ``depth_scale`` is in metres per unit of depth.
     """
     if not isinstance(frames, Frames) or not isinstance(frames.camera, Camera):
-        raise UserError(
-            f"{who}() got frames of type {type(frames).__name__}; give pewm_jax.Frames with a "
-            "pewm_jax.Camera."
-        )
+        found = f"frames of type {type(frames).__name__}"
+        raise _refusal(who, found, "pewm_jax.Frames with a pewm_jax.Camera")
     frames = jax.tree.map(
         lambda x: as_array(x, who, "frames"), frames, is_leaf=lambda x: isinstance(x, (list, tuple))
     )
     missing = [name for name, value in _fields(frames) if value is None]
     if missing:
-        raise UserError(
-            f"{who}() got frames without {' and '.join(missing)}; give colours, depth and cameras."
-        )
+        found = f"frames without {' and '.join(missing)}"
+        raise _refusal(who, found, "colours, depth and cameras")
     _check_dtypes(frames, who, depth_scale)
     if _shapes_agree(frames):
         with jax.ensure_compile_time_eval():
@@ -81,75 +74,45 @@ def require_frames(model: World, frames: Frames, who: str) -> int:
         )
     poses, intrinsics = frames.camera.world_from_camera, frames.camera.intrinsics_4
     if poses.shape != (count, 4, 4) or intrinsics.shape != (count, 4):
-        raise UserError(
-            f"{who}() got {count} frames but poses {poses.shape} and intrinsics "
-            f"{intrinsics.shape}; give ({count}, 4, 4) and ({count}, 4)."
-        )
+        found = f"{count} frames but poses {poses.shape} and intrinsics {intrinsics.shape}"
+        raise _refusal(who, found, f"({count}, 4, 4) and ({count}, 4)")
     return count
 
 
 def check_model(model: Any, who: str) -> None:
-    """Refuse what are no settings.
-
-    Raises:
-        UserError: this is no model.
-    """
+    """Refuse a model that is not settings."""
     if not dataclasses.is_dataclass(model) or isinstance(model, type):
-        raise UserError(
-            f"{who}() got a model of type {type(model).__name__}; give the settings that "
-            "pewm_jax.load returned, or their model."
-        )
+        found = f"a model of type {type(model).__name__}"
+        raise _refusal(who, found, "the settings that pewm_jax.load returned, or their model")
 
 
 def check_params(params: Any, who: str) -> None:
-    """Refuse values that cannot be parameters; which ones a world needs is not checked.
+    """Refuse values that are neither nested dictionaries nor another pytree of arrays.
 
-    Parameters are nested dictionaries, or another pytree of arrays that the world's ``init`` made.
-
-    Raises:
-        UserError: this is neither.
+    Which parameters a world needs is not checked.
     """
     leaves = jax.tree.leaves(params)
-    if isinstance(params, Mapping) or (leaves and all(hasattr(leaf, "dtype") for leaf in leaves)):
-        return
-    raise UserError(
-        f"{who}() got params of type {type(params).__name__}; give the parameters that "
-        "pewm_jax.load returned."
-    )
+    arrays = bool(leaves) and all(hasattr(leaf, "dtype") for leaf in leaves)
+    if not isinstance(params, Mapping) and not arrays:
+        found = f"params of type {type(params).__name__}"
+        raise _refusal(who, found, "the parameters that pewm_jax.load returned")
 
 
 def check_state(state: Any, model: Any, who: str) -> None:
-    """Refuse what is no state, or one whose frame is not of the model's size.
-
-    Raises:
-        UserError: this is no state of such a model.
-    """
+    """Refuse a value that is not a state, and a state whose frame is not of the model's size."""
     if not isinstance(state, WorldState):
-        raise UserError(
-            f"{who}() got a state of type {type(state).__name__}; give the WorldState that start() "
-            "or an earlier call returned."
-        )
-    clip = getattr(model, "clip", None)
-    shape, wanted = jnp.shape(state.frame.rgb_THWC), None
-    if clip is not None:
-        wanted = (1, clip.height, clip.width, 3)
-    if wanted is not None and shape != wanted:
-        raise UserError(
-            f"{who}() got a state whose frame is {shape} and not {wanted}; give a state that "
-            "start() made of this model."
-        )
+        found = f"a state of type {type(state).__name__}"
+        raise _refusal(who, found, "the WorldState that start() or an earlier call returned")
+    clip, shape = getattr(model, "clip", None), jnp.shape(state.frame.rgb_THWC)
+    if clip is not None and shape != (1, clip.height, clip.width, 3):
+        found = f"a state whose frame is {shape} and not {(1, clip.height, clip.width, 3)}"
+        raise _refusal(who, found, "a state that start() made of this model")
 
 
 def check_key(key: Any, who: str, candidates: int | None = None) -> None:
-    """Refuse what is no PRNG key, or another number of keys.
+    """Refuse values that are not a PRNG key, or not as many keys as there are candidates.
 
-    Args:
-        key: a key, or ``candidates`` keys; new typed keys, or the old ones of uint32.
-        who: the function that was called, for the message.
-        candidates: the number of keys; None for one without an axis.
-
-    Raises:
-        UserError: this is no key, or there are more or fewer.
+    Typed keys and the old ones of uint32 are keys.
     """
     one = candidates is None
     shape = found = getattr(key, "shape", None)
@@ -158,26 +121,17 @@ def check_key(key: Any, who: str, candidates: int | None = None) -> None:
         shape = found[:-1]  # the words of an old key
     elif dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
         shape = None
-    what = "a key" if one else "keys"
     if shape is None:
-        example = "jax.random.key(0)"
-        example = example if one else f"jax.random.split({example}, {candidates})"
-        raise UserError(f"{who}() got {what} of type {type(key).__name__}; give {example}.")
+        what, example = ("a key", "jax.random.key(0)") if one else ("keys", "")
+        example = example or f"jax.random.split(jax.random.key(0), {candidates})"
+        raise _refusal(who, f"{what} of type {type(key).__name__}", example)
     if shape != (() if one else (candidates,)):
         wanted = "one key" if one else f"{candidates} keys, one for each candidate"
-        raise UserError(f"{who}() got keys of shape {shape}; give {wanted}.")
+        raise _refusal(who, f"keys of shape {shape}", wanted)
 
 
 def candidates_of(controls: Any, who: str) -> int:
-    """Return K, the number of candidates.
-
-    Args:
-        controls: from ``check_control``, with a leading axis K.
-        who: the function that was called, for the message.
-
-    Raises:
-        UserError: they have no such axis, or it is empty.
-    """
+    """Return K, the length of the leading axis of controls, or refuse controls without one."""
     camera = controls.camera if isinstance(controls, Control) else controls
     if isinstance(camera, Camera):
         poses, intrinsics = (jnp.shape(x) for x in (camera.world_from_camera, camera.intrinsics_4))
@@ -189,19 +143,15 @@ def candidates_of(controls: Any, who: str) -> int:
         fits = len(shape) in (2, 3)
         found, wanted = f"actions of shape {shape}", "(K, n) integers or (K, n, 3) floats"
     if not fits or shape[0] == 0:
-        raise UserError(
-            f"{who}() got {found}; give {wanted}, with a leading axis K ≥ 1 of candidates."
-        )
+        raise _refusal(who, found, f"{wanted}, with a leading axis K ≥ 1 of candidates")
     return shape[0]
 
 
 def in_metres(frames: Frames, depth_scale: Array | float | None) -> Frames:
     """Return frames whose floats are float32 and whose depth is in metres.
 
-    Args:
-        frames: the frames.
-        depth_scale: metres per unit of depth, None for 1. Depth of 65535 in uint16 is no
-            measurement, and becomes 0.
+    ``depth_scale`` is in metres per unit of depth, None for 1. Depth of 65535 in uint16 is no
+    measurement, and becomes 0.
     """
 
     def single(x: Array) -> Array:
@@ -220,62 +170,43 @@ def in_metres(frames: Frames, depth_scale: Array | float | None) -> Frames:
 def check_control(control: Any, who: str) -> Any:
     """Return a control with arrays in the place of lists, or refuse values that steer nothing.
 
-    Args:
-        control: see ``worlds.imagine``; any leading axes.
-        who: the function that was called, for the message.
-
-    Raises:
-        UserError: this is no control; or it holds an unknown discrete action, an action that is not
-            finite, or a camera that is not rigid.
+    Any leading axes. Refused are values without a form of ``worlds.imagine``, unknown discrete
+    actions, actions that are not finite, and cameras that are not rigid.
     """
     if isinstance(control, Control):
-        arrays = {
-            name: None if value is None else as_array(value, who, name)
+        arrays = [
+            None if value is None else _finite(as_array(value, who, name), who, name)
             for name, value in (("actions", control.actions_TA), ("state", control.state_A))
-        }
-        for name, value in arrays.items():
-            if value is not None:
-                _check_finite(value, who, name)
-        return Control(_check_cameras(control.camera, who), arrays["actions"], arrays["state"])
+        ]
+        return Control(_check_cameras(control.camera, who), *arrays)
     if isinstance(control, Camera):
         return _check_cameras(control, who)
     actions = as_array(control, who, "actions")
-    if jnp.issubdtype(actions.dtype, jnp.integer):
-        _check_discrete(actions, who)
-    else:
-        _check_finite(actions, who, "actions")
+    if not jnp.issubdtype(actions.dtype, jnp.integer):
+        return _finite(actions, who, "actions")
+    _check_discrete(actions, who)
     return actions
 
 
 def as_array(value: Any, who: str, what: str) -> Array:
-    """Return an array of numbers; lists become arrays on the host, arrays stay where they are.
-
-    Raises:
-        UserError: these are no numbers, or lists of unequal lengths.
-    """
+    """Return an array of numbers; lists become arrays on the host, arrays stay where they are."""
     if isinstance(value, (jax.Array, np.ndarray, Tracer)):
         found = value
-    elif any(isinstance(leaf, (Tracer, jax.Array)) for leaf in jax.tree.leaves(value)):
-        try:
-            found = jnp.asarray(value)
-        except (TypeError, ValueError):
-            found = None
     else:
+        traced = any(isinstance(leaf, (Tracer, jax.Array)) for leaf in jax.tree.leaves(value))
         try:
-            found = np.asarray(value)
-        except ValueError:
+            found = jnp.asarray(value) if traced else np.asarray(value)
+        except (TypeError, ValueError):
             found = None
     if found is None or not _is_number(found.dtype):
         kind = f"an array of {found.dtype}" if isinstance(found, np.ndarray) else "no array"
-        raise UserError(
-            f"{who}() got {what} of type {type(value).__name__}, {kind}; give numbers as an array, "
-            "or a list of equally long lists."
-        )
+        got = f"{what} of type {type(value).__name__}, {kind}"
+        raise _refusal(who, got, "numbers as an array, or a list of equally long lists")
     return found
 
 
 def valid(control: Any, present: Camera, leading: int = 0) -> Array:
-    """Return whether all of a control is known and finite, and so is the present pose.
+    """Return whether all of a control is known and finite, and so is the present frame's pose.
 
     Args:
         control: from ``check_control``.
@@ -318,16 +249,9 @@ def kept(ok: Array, new: Any, old: Any) -> Any:
 
 
 def returned_state(model: Any, name: str, found: Any, size: tuple[int, ...]) -> WorldState:
-    """Return the state that a world's own method returned, or refuse it by the method's name.
+    """Return the state that the method ``name`` of a world returned, or refuse it by that name.
 
-    Args:
-        model: the world.
-        name: the method.
-        found: what it returned.
-        size: (1, H, W) of the present frame, or (K, 1, H, W).
-
-    Raises:
-        UserError: this is no state, or its frame has another shape or dtype.
+    The present frame must have the size (1, H, W), or (K, 1, H, W), and float values.
     """
     who = f"{type(model).__name__}.{name}()"
     if not isinstance(found, WorldState):
@@ -339,18 +263,7 @@ def returned_state(model: Any, name: str, found: Any, size: tuple[int, ...]) -> 
 def returned_frames(
     model: Any, name: str, found: Any, present: tuple[int, ...], count: int
 ) -> tuple[WorldState, Frames]:
-    """Return what a world's own method imagined, or refuse it by the method's name.
-
-    Args:
-        model: the world.
-        name: the method.
-        found: what it returned.
-        present: as ``size`` of ``returned_state``.
-        count: the number of frames that were asked for.
-
-    Raises:
-        UserError: this is no state with frames, or a shape or dtype is another.
-    """
+    """Return the state and the ``count`` frames that a method returned; see ``returned_state``."""
     who = f"{type(model).__name__}.{name}()"
     if not isinstance(found, tuple) or len(found) != 2:
         raise UserError(
@@ -369,7 +282,7 @@ def steps_of(control: Any, leading: int = 0) -> int:
 
 
 def _check_returned(frames: Any, what: str, size: tuple[int, ...]) -> None:
-    """Refuse frames of a world's own that have another shape, or integers."""
+    """Refuse frames of another shape, or of integers, that a world's method returned."""
     if not isinstance(frames, Frames):
         raise UserError(f"{what} must be Frames: a {type(frames).__name__} is none.")
     *leading, _, _ = size
@@ -399,13 +312,11 @@ def _is_number(dtype: Any) -> bool:
 
 
 def _check_dtypes(frames: Frames, who: str, depth_scale: float | None) -> None:
-    """Refuse dtypes without a meaning; works on traced frames, too."""
+    """Refuse dtypes without a meaning, also of traced frames."""
     for name, value in _fields(frames):
         if jnp.issubdtype(value.dtype, jnp.bool_):
-            raise UserError(
-                f"{who}() got {name} of type bool; give colours as uint8 or floats in [−1, 1], and "
-                "depth, poses and intrinsics as float32."
-            )
+            wanted = "colours as uint8 or floats in [−1, 1], and depth, poses and intrinsics as"
+            raise _refusal(who, f"{name} of type bool", f"{wanted} float32")
     depth = frames.depth_THW
     if depth_scale is None and jnp.issubdtype(depth.dtype, jnp.integer):
         raise UserError(
@@ -419,10 +330,8 @@ def _check_dtypes(frames: Frames, who: str, depth_scale: float | None) -> None:
     except (TypeError, ValueError):
         scale = math.nan
     if not (math.isfinite(scale) and scale > 0):
-        raise UserError(
-            f"{who}() got depth_scale {depth_scale!r}; give the metres per unit of depth, a number "
-            "above 0, such as 0.001 for millimetres."
-        )
+        wanted = "the metres per unit of depth, a number above 0, such as 0.001 for millimetres"
+        raise _refusal(who, f"depth_scale {depth_scale!r}", wanted)
 
 
 def _shapes_agree(frames: Frames) -> bool:
@@ -435,6 +344,7 @@ def _shapes_agree(frames: Frames) -> bool:
 
 
 def _check_values(frames: Frames, who: str) -> None:
+    """Refuse colours, depth, poses and intrinsics whose values cannot be used."""
     rgb, depth = frames.rgb_THWC, frames.depth_THW
     named = {
         "rgb": _ranges(rgb),
@@ -443,12 +353,21 @@ def _check_values(frames: Frames, who: str) -> None:
         "intrinsics": frames.camera.intrinsics_4,
     }
     known: dict[str, Any] = jax.device_get({k: v for k, v in named.items() if _is_known(v)})
-    if "rgb" in known:
-        low, high = known["rgb"]
-        _check_colors(rgb.dtype, low, high, who)
-    if "depth" in known:
-        low, high = known["depth"]
-        _check_depth(low, high, who)
+    least, most = -1.0 - COLOR_TOLERANCE, 1.0 + COLOR_TOLERANCE
+    if jnp.issubdtype(rgb.dtype, jnp.integer):
+        least, most = 0.0, 255.0
+    colours = "uint8 in [0, 255], or floats in [−1, 1] (bytes / 127.5 − 1)"
+    metres = "finite metres along z, and 0 where nothing was measured"
+    for name, what, low, high, wanted in (
+        ("rgb", f"{rgb.dtype} colours", least, most, colours),
+        ("depth", "depth", 0.0, np.finfo(np.float64).max, metres),
+    ):
+        if name in known:
+            lowest, highest = (x.astype(np.float64) for x in known[name])
+            frame = _first(~((lowest >= low) & (highest <= high)))
+            if frame is not None:
+                found = f"{what} from {lowest[frame]:g} to {highest[frame]:g} in frame {frame}"
+                raise _refusal(who, found, wanted)
     if "poses" in known:
         _check_poses(known["poses"], who)
     if "intrinsics" in known:
@@ -465,12 +384,10 @@ def _is_known(value: Any) -> bool:
 
 
 def _ranges(x: Array) -> tuple[Array, Array] | None:
-    """Return the lowest and highest value of each frame, NaN if there is any; None if unknown.
-
-    They are computed where the array is, so that no images are copied from an accelerator.
-    """
+    """Return the lowest and highest value of each frame, NaN if there is any; None if unknown."""
     if not _is_known(x):
         return None
+    # They are computed where the array is, so that no images are copied from an accelerator.
     if isinstance(x, jax.Array) and any(device.platform != "cpu" for device in x.devices()):
         return _device_ranges(x)
     values = np.asarray(x).reshape(len(x), -1)
@@ -487,30 +404,6 @@ def _device_ranges(x: Array) -> tuple[Array, Array]:
 def _first(wrong: Any) -> int | None:
     """Return the number of the first frame that is wrong."""
     return int(np.argmax(wrong)) if wrong.any() else None
-
-
-def _check_colors(dtype: Any, low: np.ndarray, high: np.ndarray, who: str) -> None:
-    if jnp.issubdtype(dtype, jnp.integer):
-        least, most = 0.0, 255.0
-    else:
-        least, most = -1.0 - COLOR_TOLERANCE, 1.0 + COLOR_TOLERANCE
-    low, high = low.astype(np.float64), high.astype(np.float64)
-    frame = _first(~((low >= least) & (high <= most)))
-    if frame is not None:
-        raise UserError(
-            f"{who}() got {dtype} colours from {low[frame]:g} to {high[frame]:g} in frame {frame}; "
-            "give uint8 in [0, 255], or floats in [−1, 1] (bytes / 127.5 − 1)."
-        )
-
-
-def _check_depth(low: np.ndarray, high: np.ndarray, who: str) -> None:
-    low, high = low.astype(np.float64), high.astype(np.float64)
-    frame = _first(~((low >= 0) & (high < np.inf)))
-    if frame is not None:
-        raise UserError(
-            f"{who}() got depth from {low[frame]:g} to {high[frame]:g} in frame {frame}; give "
-            "finite metres along z, and 0 where nothing was measured."
-        )
 
 
 def _check_poses(poses: np.ndarray, who: str) -> None:
@@ -564,9 +457,7 @@ def _check_intrinsics(intrinsics: np.ndarray, size: tuple[int, ...] | None, who:
 def _check_cameras(camera: Any, who: str) -> Camera:
     """Return cameras as arrays; values are checked where they are known and the shapes fit."""
     if not isinstance(camera, Camera):
-        raise UserError(
-            f"{who}() got cameras of type {type(camera).__name__}; give a pewm_jax.Camera."
-        )
+        raise _refusal(who, f"cameras of type {type(camera).__name__}", "a pewm_jax.Camera")
     poses = as_array(camera.world_from_camera, who, "poses")
     intrinsics = as_array(camera.intrinsics_4, who, "intrinsics")
     if poses.shape[-2:] == (4, 4) and poses.size and _is_known(poses):
@@ -576,17 +467,17 @@ def _check_cameras(camera: Any, who: str) -> Camera:
     return Camera(intrinsics, poses)
 
 
-def _check_finite(values: Array, who: str, what: str) -> None:
+def _finite(values: Array, who: str, what: str) -> Array:
+    """Return values, or refuse booleans and values that are known and not finite."""
     if jnp.issubdtype(values.dtype, jnp.bool_):
-        raise UserError(f"{who}() got {what} of type bool; give integers or floats.")
-    if not jnp.issubdtype(values.dtype, jnp.floating) or not _is_known(values):
-        return
-    found = np.asarray(values)
-    wrong = found[~np.isfinite(found)]
-    if wrong.size:
-        raise UserError(
-            f"{who}() got {what} that are not finite ({wrong.ravel()[0]}); give metres and radians."
-        )
+        raise _refusal(who, f"{what} of type bool", "integers or floats")
+    if jnp.issubdtype(values.dtype, jnp.floating) and _is_known(values):
+        found = np.asarray(values)
+        wrong = found[~np.isfinite(found)]
+        if wrong.size:
+            found = f"{what} that are not finite ({wrong.ravel()[0]})"
+            raise _refusal(who, found, "metres and radians")
+    return values
 
 
 def _check_discrete(actions: Array, who: str) -> None:

@@ -26,10 +26,10 @@ from pewm_jax.config import (
     TrainSettings,
     register,
 )
-from pewm_jax.errors import require
+from pewm_jax.errors import require, require_fields
 from pewm_jax.geometry import depth_images
 from pewm_jax.memory import interface as memories
-from pewm_jax.models.lpips import convert as lpips_weights
+from pewm_jax.models.lpips import convert as lpips_convert
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.registry import of, part
 from pewm_jax.types import Array, Camera, Clip, Frames, Params
@@ -93,9 +93,8 @@ class CodecTrainConfig(TrainSettings):
             "use 0 (pewm-jax evaluate prints its numbers).",
         )
         weights = ("gradient_weight", "squared_weight", "lpips_weight")
-        for name in ("latent_noise", "gate_noise", *weights):
-            value = getattr(self, name)
-            require(value >= 0, f"train.{name} is {value}: use 0 or more.")
+        names = ("latent_noise", "gate_noise", *weights)
+        require_fields(self, "train", lambda value: value >= 0, "0 or more", *names)
 
 
 @register("world", "codec")
@@ -158,11 +157,10 @@ class CodecTask(Task):
         return dataclasses.replace(self, codec=plain).init(key)
 
     def pictures(self, clip: Clip) -> tuple[Array, Array]:
-        """Return a batch's frames as the codec sees them, and which pixels count.
+        """Return a batch's frames as the codec's input, and which pixels count.
 
-        Returns:
-            (2, N, H, W, 3) colour and depth as a grey picture, in [−1, 1], and (2, N, H, W, 1): 0
-            where depth was not measured, else 1.
+        Returns: (2, N, H, W, 3) colour and depth as a grey image, in [−1, 1], and (2, N, H, W, 1):
+            0 where depth was not measured, else 1.
         """
         frames = as_signal(clip.frames)
         rgb = frames.rgb_THWC.reshape(-1, *frames.rgb_THWC.shape[-3:])
@@ -177,14 +175,14 @@ class CodecTask(Task):
     ) -> tuple[Array, dict[str, Array]]:
         """Return the loss of stage ``codec``: frames reconstructed from noisy latents.
 
-        Absolute and squared error of the pixels, and absolute error of the differences between
-        neighbours, with the weights in ``train``; depth counts where it was measured. Where
-        ``train.lpips_weight`` asks for it, LPIPS of colour too. The noise of a channel is relative
-        to its deviation in the batch, so that larger latents gain nothing.
+        The loss is the absolute and squared error of the pixels, and the absolute error of the
+        differences between neighbours, with the weights in ``train``; depth counts where it was
+        measured. With ``train.lpips_weight``, LPIPS of colour is added. The noise of a channel is
+        relative to its deviation in the batch, so that larger latents gain nothing.
 
-        Returns:
-            ``(loss, measured)``: of colour ``psnr_rgb`` in decibels and ``lpips``, if it counts; of
-            depth ``depth_m``, the mean absolute error in metres; all through the noise.
+        Returns: ``(loss, measured)``: of colour ``psnr_rgb`` in decibels and, if it counts,
+            ``lpips``; of depth ``depth_m``, the mean absolute error in metres; all of
+            reconstructions from noise.
         """
         assert isinstance(train, CodecTrainConfig)
         truth, counts = self.pictures(clip)
@@ -219,24 +217,16 @@ class CodecTask(Task):
         }
 
     def perceptual(self, train: TrainSettings) -> Params | None:
-        """Return the weights of LPIPS that ``reconstruct`` needs, under ``lpips``, or None.
-
-        Raises:
-            UserError: they are asked for and absent, damaged, or of another network, or the frames
-                are too small for it.
-        """
+        """Return the weights that ``reconstruct`` needs, or None; see ``lpips_weights``."""
         assert isinstance(train, CodecTrainConfig)
         if not train.lpips_weight:
             return None
-        file = lpips_weights.find(train.lpips_net, train.lpips_file)
-        found = {"lpips": lpips_weights.read(file, train.lpips_net)[1]}
-        lpips.require_size(train.lpips_net, self.clip.height, self.clip.width)
-        return found
+        return lpips_weights(train.lpips_net, self.clip, train.lpips_file)
 
     def distribute(
         self, train: TrainSettings, params: Params, clip: Clip, key: Array
     ) -> tuple[Array, dict[str, Array]]:
-        """Return the loss of stage ``statistics``: how unlikely latents are under its normal law.
+        """Return the loss of stage ``statistics``: the negative log-likelihood of latents.
 
         It is least where ``latent_mean_C`` and ``latent_scale_C`` are mean and standard deviation.
         """
@@ -255,9 +245,8 @@ class CodecTask(Task):
     def rendered(self, clip: Clip) -> tuple[Array, Array]:
         """Render each clip's memory of its context for the clip's frames.
 
-        Returns:
-            ``(rendered_BTHWC, seen_BTHW)``: colour and depth signal (4 channels), and where there
-            is anything.
+        Returns: ``(rendered_BTHWC, seen_BTHW)``: colour and depth signal (4 channels), and which
+            pixels show anything.
         """
         height, width = self.clip.height, self.clip.width
 
@@ -274,25 +263,14 @@ class CodecTask(Task):
     def mix(
         self, train: TrainSettings, params: Params, clip: Clip, key: Array
     ) -> tuple[Array, dict[str, Array]]:
-        """Return the loss of stage ``gate``.
+        """Return the loss of stage ``gate``; see ``score``.
 
         The frames after each clip's first, which is part of its context, are encoded; noise of a
-        random size is added to the latents, and the gate mixes what is decoded with the rendering.
-
-        Returns:
-            ``(loss, measured)``: the logarithm of each frame's squared error and a little absolute
-            error, of colour and of depth where it was measured, so that frames of which little was
-            seen before do not outweigh those of which much was; PSNR of colour in decibels, of what
-            is decoded and of what the gate makes of it, and where anything was rendered also of
-            that alone; ``depth_m``, the mean absolute error of the gate's depth.
+        random size is added to the latents, and the gate mixes the decoded frames with the
+        rendering.
         """
         assert isinstance(train, CodecTrainConfig)
-        frames = as_signal(clip.frames)
-        later = Frames(
-            frames.rgb_THWC[:, 1:],
-            frames.depth_THW[:, 1:],
-            jax.tree.map(lambda x: x[:, 1:], frames.camera),
-        )
+        later = jax.tree.map(lambda x: x[:, 1:], as_signal(clip.frames))
         asked = Clip(later, clip.context, clip.context_valid_S)
         shown_BTHWC, seen_BTHW = jax.lax.stop_gradient(self.rendered(asked))
         latents = rgbd.encode_rgbd(self, params, later.rgb_THWC, later.depth_THW)  # type: ignore[arg-type]
@@ -304,36 +282,31 @@ class CodecTask(Task):
 
     def stages(self) -> tuple[Stage, ...]:
         """Return the stages: two, and one for the gate if there is one."""
-        without_gate = CodecTask._without_gate
+        first = ((STATISTICS, FREEZE), (NETWORKS, TRAIN))
+        second = ((STATISTICS, TRAIN), (NETWORKS, FREEZE))
+        third = ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE))
+        init, weights = CodecTask._without_gate, CodecTask.perceptual
         stages = (
-            Stage(
-                "codec",
-                1,
-                ((STATISTICS, FREEZE), (NETWORKS, TRAIN)),
-                without_gate,
-                CodecTask.reconstruct,
-                extra_weights=CodecTask.perceptual,
-            ),
-            Stage(
-                "statistics",
-                2,
-                ((STATISTICS, TRAIN), (NETWORKS, FREEZE)),
-                without_gate,
-                CodecTask.distribute,
-            ),
-            Stage(
-                "gate",
-                3,
-                ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE)),
-                CodecTask.init,
-                CodecTask.mix,
-            ),
+            Stage("codec", 1, first, init, CodecTask.reconstruct, extra_weights=weights),
+            Stage("statistics", 2, second, init, CodecTask.distribute),
+            Stage("gate", 3, third, CodecTask.init, CodecTask.mix),
         )
         return stages if self.codec.gate else stages[:2]
 
     def sharding(self) -> tuple[tuple[str, Any], ...]:
         """Return the codec's rules."""
         return self.codec.SHARDING
+
+
+def lpips_weights(net: lpips.Net, clip: ClipConfig, file: str = "") -> Params:
+    """Return the weights of LPIPS from a file, or of the installed package, under ``lpips``.
+
+    Raises:
+        UserError: they are absent, damaged, or of another network, or the frames are too small.
+    """
+    found = {"lpips": lpips_convert.read(lpips_convert.find(net, file), net)[1]}
+    lpips.require_size(net, clip.height, clip.width)
+    return found
 
 
 def _moments(latents: Array) -> tuple[Array, Array]:
@@ -364,17 +337,23 @@ def score(
     truth: Frames,
     perceptual: tuple[float, Params] | None = None,
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of a gate on decoded frames and the rendered memory; see ``CodecTask.mix``.
+    """Return the loss of a gate on decoded frames and the rendered memory.
 
     Args:
-        model: the model; its clip says what depth is as a signal.
+        model: the model; its clip defines the depth signal.
         gate: the gate's parameters.
         rgb_BTHWC: decoded colours.
         depth_BTHW: decoded depth, metres.
         shown_BTHWC: colour and depth signal of the memory, 4 channels.
-        seen_BTHW: where it shows anything.
+        seen_BTHW: which pixels show anything.
         truth: the recorded frames, colours in [−1, 1].
-        perceptual: a weight and the weights of LPIPS, which then counts too, and is measured.
+        perceptual: a weight and the weights of LPIPS, which is then added and measured.
+
+    Returns: ``(loss, measured)``: the logarithm of each frame's squared error plus a little
+        absolute error, of colour and of measured depth, so that frames with few pixels seen before
+        do not outweigh the others; PSNR of colour in decibels, of the gate's result and of the
+        decoded frames, and where anything was rendered also of the rendering; ``depth_m``, the mean
+        absolute error of the gate's depth.
     """
     decoded = _four(model, rgb_BTHWC, depth_BTHW)
     wanted = _four(model, truth.rgb_THWC, truth.depth_THW)

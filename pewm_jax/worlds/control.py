@@ -15,15 +15,11 @@ from pewm_jax.types import Array, Camera, Control, Frames
 def control_of(model: World, present: Camera, control: Any) -> Control:
     """Return (n,) cameras of the frames to imagine, and the (n, A) actions that lead to them.
 
-    Of a ``Control`` the present frame is not a part here, in contrast to those of training.
-
-    Args:
-        model: defines what a discrete action does.
-        present: (1,) the camera of the present frame.
-        control: actions, a ``Camera`` or a ``Control``; see ``worlds.imagine``.
+    In contrast to the ``Control`` of training, the present frame, whose camera is (1,), is not a
+    part.
 
     Raises:
-        UserError: the control is empty or has none of these forms. Values are checked by
+        UserError: the control is empty or has no form of ``worlds.imagine``. Values are checked by
             ``worlds.checks``.
     """
     found = _in_one_form(model, present, control)
@@ -32,16 +28,7 @@ def control_of(model: World, present: Camera, control: Any) -> Control:
 
 
 def require_actions(model: World, actions_TA: Array | None, who: str) -> None:
-    """Refuse what lacks the actions that the model's control needs, or has others.
-
-    Args:
-        model: the model.
-        actions_TA: (..., T, A) actions, or None.
-        who: where they came in, for the message.
-
-    Raises:
-        UserError: they are absent, or of another width.
-    """
+    """Refuse missing actions that the model's control needs, and (…, A) actions of another A."""
     wanted, kind = model.batch_spec.actions, model.facts.control
     if not wanted:
         return
@@ -106,17 +93,13 @@ def _require_cameras(camera: Camera) -> int:
 
 
 def cut_into_clips(asked: Control, length: int) -> tuple[Control, Array | None]:
-    """Cut the control of n frames into clips.
-
-    Args:
-        asked: (n) cameras of the frames to imagine, and (n, A) actions, if there are any.
-        length: frames that a clip imagines.
+    """Cut the control of n frames into clips that imagine ``length`` frames each.
 
     Returns:
         ``(chunks, wanted)``: the control with leading axes (clips, length), and which of these
         frames were asked for, or None if all were. Where frames are missing the agent stands still.
-        A state that is given is that before the first clip; before the others it is what the
-        action before says.
+        A given state is that before the first clip; before each other clip it is the preceding
+        action.
     """
     count = asked.camera.world_from_camera.shape[0]
     clips = -(-count // length)

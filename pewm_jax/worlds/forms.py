@@ -1,8 +1,8 @@
 """Parameters of worlds whose ``init`` returns another pytree than nested dictionaries.
 
-Training, files and sharding name a parameter by its path and keep nested dictionaries. A world may
-return lists, tuples or dataclasses from ``init``: its methods get that form again. The worlds of
-this package return nested dictionaries.
+Training, files and sharding name a parameter by its path in nested dictionaries. A world's ``init``
+may return lists, tuples or dataclasses; its methods get that form again. The worlds of this package
+return nested dictionaries.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The task that trains the policy NoMaD, by imitation of recorded walks.
 
-A clip has the earlier pictures, the present one and those of as many later steps as a goal may be
-away. From it are taken the waypoints, the places after the next steps, and the goal: the picture
-some steps on, or, once in as many times, one from another clip of the batch, which counts as
-farthest away and whose way is not learned (Sridhar et al. 2023, as in ``visualnav-transformer``).
+A clip has the earlier images, the present one and those of as many later steps as a goal may be
+away. The waypoints are the positions after the next steps. The goal is the image some steps later
+or, in one of that many cases, an image of another clip of the batch, whose distance counts as the
+largest and whose waypoints do not count (Sridhar et al. 2023, as in ``visualnav-transformer``).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pewm_jax.config import (
     register,
 )
 from pewm_jax.diffusion import squared_cosine
-from pewm_jax.errors import require
+from pewm_jax.errors import require, require_fields
 from pewm_jax.geometry import actions, cameras
 from pewm_jax.models.nomad import model as nomad
 from pewm_jax.models.nomad.config import NomadConfig
@@ -67,9 +67,8 @@ class NomadTrainConfig(TrainSettings):
             "train.policy.batch is 1: a goal that cannot be reached is taken from another clip of "
             "the batch, use 2 or more.",
         )
-        for name in ("goal_hidden", "distance_weight"):
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"train.{name} is {value}: use a share in [0, 1].")
+        names = ("goal_hidden", "distance_weight")
+        require_fields(self, "train", lambda value: 0 <= value <= 1, "a share in [0, 1]", *names)
         require(self.nearest >= 0, f"train.nearest is {self.nearest}: use 0 or more steps.")
 
 
@@ -119,7 +118,7 @@ class NomadTask(Task):
         return {"policy": nomad.init(self.policy, key)}
 
     def waypoints(self, clip: Clip) -> Array:
-        """Return (B, N, 2): the places after the next N steps, metres forward and left of here."""
+        """Return (B, N, 2): the positions after the next N steps, metres forward and left."""
         now, count = self.policy.context, self.policy.waypoints
         pose = jnp.asarray(clip.frames.camera.world_from_camera)
         here = pose[:, now]
@@ -130,15 +129,14 @@ class NomadTask(Task):
     def imitate(
         self, train: TrainSettings, params: Params, clip: Clip, key: Array
     ) -> tuple[Array, dict[str, Array]]:
-        """Return the loss: the squared error of the noise, and, weighing little, of the distance.
+        """Return the loss: squared error of the noise and, with a small weight, of the distance.
 
         The noise counts where the goal is of the same walk, farther than ``train.nearest`` and
         nearer than the farthest; the distance where the goal is not hidden. (The reference averages
         the error of the distance over hidden goals too.)
 
-        Returns:
-            ``(loss, measured)``: ``noise``, the mean squared error, and ``steps_off``, the root
-            mean square error of the distance.
+        Returns: ``(loss, measured)``: ``noise``, the mean squared error, and ``steps_off``, the
+            root mean square error of the distance.
         """
         assert isinstance(train, NomadTrainConfig)
         policy, weights = self.policy, params["policy"]

@@ -1,14 +1,14 @@
-"""The training loss of PEWM's stages (paper, Eqs. 3 and 4; see ``diffusion.noise`` for targets).
+"""The training loss of PEWM's stages (paper, Eqs. 3 and 4; see ``config.parts.Noise`` for targets).
 
 Chained clips (``train.chained``): in a rollout every clip but the first starts from an imagined
-frame, and a model that learned on observed frames alone trusts it too much. Imagining whole clips
-would cost a sampling for each step of training. Instead, a share of the clips is run backwards
-once, from the last frame to the first: the true latents get noise of a level drawn as in training,
-and the model, with its present weights, denoises them in one step, given the last frame and the
-same memory. The clip then starts from the first frame of the result, decoded and, where the codec
-has a gate and the reader reads pictures, mixed with the rendered memory. No gradient flows through
-it. This is weaker than a rollout: one step instead of a sampling, no guidance, and the memory holds
-observed frames only.
+frame, which a model that learned on observed frames alone trusts too much. Imagining whole clips
+would cost a sampling per training step. Instead, a share of the clips is run backwards once, from
+the last frame to the first: the true latents get noise of a level drawn as in training, and the
+model, with its present weights, denoises them in one step, given the last frame and the same
+memory. The clip then starts from the first frame of the result, decoded and, where the codec has a
+gate and the reader reads pictures, mixed with the rendered memory. No gradient flows through it.
+This is weaker than a rollout: one step instead of a sampling, no guidance, and a memory of observed
+frames only.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ FINE = 0.3
 def clip_readout(
     model: AssembledModel, params: Params, clip: Clip, *, pictures: bool = False
 ) -> MemoryReadout:
-    """Build every clip's memory from its context and return what it shows, leading axis B.
+    """Build every clip's memory from its context and return its readout, leading axis B.
 
-    Pictures are rendered clip by clip: one by itself fits a processor's cache. They are made even
-    if the reader needs none where ``pictures`` asks for them.
+    Pictures are rendered clip by clip, because one clip fits a processor's cache. With ``pictures``
+    they are rendered even if the reader needs none.
     """
 
     def of_batch(weights: Params, clip: Clip) -> MemoryReadout:
@@ -79,24 +79,13 @@ def _features(model: AssembledModel, weights: Params, rgb_BSHWC: Array) -> Array
 
 
 def prepare(model: AssembledModel, params: Params, clip: Clip, *, memory: bool) -> Clip:
-    """Encode a batch's frames and look at its memories; the context is not kept.
-
-    Args:
-        model: the model.
-        params: the world model's parameters; codec and image encoder are used.
-        clip: a batch, leading axis B.
-        memory: whether the memory is read (in stage 2).
+    """Encode a batch's frames and, with ``memory``, read out its memories; the context is dropped.
 
     Returns:
         The batch with the extras ``latents_thwC`` and, with a memory, ``readout``.
     """
     frames = as_signal(clip.frames)
-    emptied = dataclasses.replace(
-        clip,
-        context=jax.tree.map(lambda x: x[:, :0], clip.context),
-        context_valid_S=clip.context_valid_S[:, :0],
-    )
-    return emptied.with_extras(
+    return clip.without_context().with_extras(
         context_features_ShwF=None,
         latents_thwC=rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
         readout=clip_readout(model, params, clip) if memory else None,
@@ -118,19 +107,18 @@ def loss(
 
     Args:
         model: the model.
-        train: the training's settings; give the noise on the observed frame, the share of clips
-            that start from the model's own (``first_frames``), and that without memory.
+        train: settings of noise on the observed frame, chained clips and hidden memories.
         params: the world model's parameters.
         clip: a batch, leading axis B, colours uint8 or float.
         key: randomness of times, noise and image noise.
         memory: whether the memory is read (in stage 2).
         history: frames of a clip that are observed.
-        blind: share of clips from which is hidden what guidance is on.
+        blind: share of clips from which the input of guidance is hidden.
 
     Returns:
         ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of the noise's target,
         averaged over colour and over depth where it was measured. If the denoiser works without
-        depth (``clip.depth``), only colour counts. Latent frames that the backbone is given
+        depth (``clip.depth``), only colour counts. Known latent frames of the backbone
         (``Conditioning.known_Bt``) do not count.
     """
     frames = as_signal(clip.frames)
@@ -193,26 +181,23 @@ def loss(
 
 
 def hide_readout(readout: MemoryReadout, kept_B: Array) -> MemoryReadout:
-    """Mask the memory's readout for the clips of a batch that are not kept."""
-    tokens, view, encoded = readout.tokens, readout.view, readout.encoded
-    if tokens is not None:
-        tokens = dataclasses.replace(tokens, valid_M=tokens.valid_M & kept_B[:, None])
-    if view is not None:
-        seen = view.seen_THW & kept_B[:, None, None, None]
-        view = dataclasses.replace(view, seen_THW=seen)
-    if encoded is not None:
-        seen = encoded.seen_THW & kept_B[:, None, None, None]
-        encoded = dataclasses.replace(encoded, seen_THW=seen)
-    return MemoryReadout(tokens, view, encoded)
+    """Mask the memory's readout for the clips of a batch that are not in ``kept_B``."""
+
+    def masked(part: Any, name: str) -> Any:
+        if part is None:
+            return None
+        mask = getattr(part, name)
+        kept = kept_B[(slice(None), *[None] * (mask.ndim - 1))]
+        return dataclasses.replace(part, **{name: mask & kept})
+
+    names = {"tokens": "valid_M", "view": "seen_THW", "encoded": "seen_THW"}
+    return MemoryReadout(**{part: masked(getattr(readout, part), m) for part, m in names.items()})
 
 
 def depth_noise(key: Array, shape: tuple[int, ...], most: float) -> Array:
-    """Draw multiplicative errors of depth: smooth over the image, and small per pixel.
+    """Draw multiplicative errors of depth (B, T, H, W): smooth over the image, and small per pixel.
 
-    Args:
-        key: randomness.
-        shape: (B, T, H, W).
-        most: each clip draws its size from 0 to this, a share of the depth.
+    Each clip draws its size from 0 to ``most``, a share of the depth.
     """
     size_key, broad_key, fine_key = jax.random.split(key, 3)
     batch, frames, height, width = shape
@@ -238,7 +223,7 @@ def first_frames(
     readout: MemoryReadout | None,
     key: Array,
 ) -> tuple[Array, Array]:
-    """Return the first frames of a batch of clips, a share of them as the model makes them.
+    """Return the first frames of a batch of clips, a share of them predicted by the model.
 
     Only the leading clips of a batch, as many as the share asks for, go through the model.
 
@@ -249,7 +234,7 @@ def first_frames(
         params: the world model's parameters.
         frames: (B, T) the clips' frames, colours in [−1, 1].
         latents_BthwC: their latents.
-        readout: what the memory shows the clips, leading axis B, or None without memory.
+        readout: the memory's readout, leading axis B, or None without memory.
         key: randomness of choice, level and noise.
 
     Returns:
@@ -293,10 +278,9 @@ def first_frames(
 
 
 def backwards(model: AssembledModel, readout: MemoryReadout) -> MemoryReadout:
-    """Return what the memory shows clips that are run backwards; leading axes B and T.
+    """Return the readout of clips that are run backwards; leading axes B and T.
 
-    Tokens have no order in time. All else is reversed along T; latents that stand for one frame
-    each are reversed as frames are.
+    Tokens have no order in time; all other parts are reversed along T.
 
     Raises:
         UserError: the codec folds several frames into a latent one, and the reader takes latents,
@@ -308,13 +292,9 @@ def backwards(model: AssembledModel, readout: MemoryReadout) -> MemoryReadout:
             "latents and the codec folds several frames into one latent: use a codec of single "
             "frames, memory.reader.picture pixels, or train.chained 0."
         )
-    parts = {field.name: getattr(readout, field.name) for field in dataclasses.fields(readout)}
-    reversed_parts = {
-        name: jax.tree.map(lambda x: x[:, ::-1], part)
-        for name, part in parts.items()
-        if name != "tokens"
-    }
-    return dataclasses.replace(readout, **reversed_parts)
+    pictures = dataclasses.replace(readout, tokens=None)
+    pictures = jax.tree.map(lambda x: x[:, ::-1], pictures)
+    return dataclasses.replace(pictures, tokens=readout.tokens)
 
 
 def _looking_back(
@@ -325,7 +305,7 @@ def _looking_back(
     readout: MemoryReadout | None,
     key: Array,
 ) -> tuple[Array, Array]:
-    """Run clips backwards, and return what the model makes of the frames where they arrive."""
+    """Run clips backwards in one denoising step, and return the predicted frames at their start."""
     back = jax.tree.map(lambda x: x[:, ::-1], frames)
     if model.codec.framewise:  # latents of one frame each
         x0 = latents_BthwC[:, ::-1]

@@ -1,8 +1,7 @@
-"""Training stages: what is trained, by which loss, in which order.
+"""Training stages: trained parameters, loss and order.
 
-Each world names its stages. A stage has a loss and rules over parameter paths that say what is
-trained and what is frozen. Its settings (steps, batch, learning rate) are in ``train``, under its
-name.
+Each world lists its stages. A stage has a loss, and rules over parameter paths that select trained
+and frozen parameters. Its settings (steps, batch, learning rate) are in ``train``, under its name.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ class Stage:
         name: names its settings (``train.NAME``), folders and log entries.
         number: its place among the world's stages, from 1; seeds its weights, noise and data order.
         rules: (pattern, ``TRAIN`` or ``FREEZE``) over parameter paths, the first match wins (see
-            ``pewm_jax.io.tree``); a leaf that none matches is an error.
+            ``pewm_jax.io.tree``); a leaf that no rule matches is an error.
         init: ``init(model, key) -> params``, all the parameters that the stage needs.
-        loss: what it minimises.
+        loss: the function to minimise.
         memory: whether it reads the clips' context, and so may use cached image features.
-        prepare: ``prepare(model, params, clip) -> clip``: does beforehand what the loss computes of
-            a batch with frozen weights alone, and leaves out what that no longer needs; the loss is
+        prepare: ``prepare(model, params, clip) -> clip``: computes beforehand the parts of the loss
+            that depend on frozen weights alone, and drops arrays that are then unused; the loss is
             the same.
         prepares_by: the top-level parameters that ``prepare`` reads.
         extra_weights: ``extra_weights(model, train) -> params`` or None: weights that the loss
-            needs and that are no part of the model, under top-level names of their own. They are
+            needs and that are not part of the model, under top-level names of their own. They are
             read when training starts, placed on every device, never trained and never saved.
-        optional: whether it is left out where its settings give it no steps.
-        require: ``require(model)``, where not every model has what the stage trains: refuses one
-            that has not, before any stage is trained.
+        optional: whether it is skipped if its settings give it no steps.
+        require: ``require(model)`` refuses a model without the parameters that the stage trains,
+            before any stage is trained.
         rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
             learning rate there is the stage's times the factor; elsewhere it is the stage's.
     """

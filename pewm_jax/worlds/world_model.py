@@ -1,13 +1,13 @@
 """The world model's network: the denoiser, conditioned on frame, control, text and memory.
 
-Input channels, in order: noisy colour and depth latents; what shows the observed frames, as the
-backbone wants it (by default their latents, zero for later frames); the channels of the control
-(Plücker rays). At the places that the backbone provides, a reader reads the memory.
+Input channels, in order: noisy colour and depth latents; the observed frames in the backbone's form
+(by default their latents, zero for later frames); the channels of the control (Plücker rays). At
+the injection points of the backbone, a reader reads the memory.
 
 Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
-frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (with which the backbone sees images)
-and ``text`` (the prompt's embedding, and a negative one's where guidance is on text). Without the
-``memory`` entry, or without sight of a memory, it is the stage-1 model.
+frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (the backbone's image encoder) and
+``text`` (the prompt's embedding, and a negative one's where guidance is on text). Without the
+``memory`` entry, or without a readout, it is the stage-1 model.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ClipConditioning:
-    """Everything that conditions a batch of clips, except the memory.
+    """Conditioning of a batch of clips, except the memory.
 
     Attributes:
         backbone: the backbone's conditioning.
@@ -84,16 +84,10 @@ def condition(
 def blind(
     model: AssembledModel, params: Params, conditioning: ClipConditioning, hidden_B: Array
 ) -> ClipConditioning:
-    """Hide from clips of a batch what guidance is on, in a world without a memory.
+    """Hide the input of guidance from the clips in ``hidden_B``, in a world without a memory.
 
-    That is the observed image, or, of a backbone that is guided by text, the prompt: the negative
-    prompt stands in its place.
-
-    Args:
-        model: the model.
-        params: the world model's parameters; ``text`` is used.
-        conditioning: of a batch of clips.
-        hidden_B: (B,) bool, the clips from which it is hidden.
+    That is the observed image or, for a backbone that is guided by text, the prompt, which the
+    negative prompt replaces.
     """
     tokens = conditioning.backbone.tokens_BLC
     if not model.backbone.GUIDED_BY_TEXT:
@@ -111,13 +105,7 @@ def blind(
 def without_image(
     model: AssembledModel, conditioning: ClipConditioning, hidden_B: Array
 ) -> ClipConditioning:
-    """Hide the observed image from clips of a batch; control, text and scalars stay.
-
-    Args:
-        model: the model.
-        conditioning: of a batch of clips.
-        hidden_B: (B,) bool, the clips that are not to see it.
-    """
+    """Hide the observed image from the clips in ``hidden_B``; control, text and scalars stay."""
     given = conditioning.backbone
 
     def hide(x: Array, channels: int) -> Array:
@@ -147,10 +135,7 @@ def _text(model: AssembledModel, params: Params, batch: int, more: Array | None)
 
 
 def init(model: AssembledModel, key: Array, *, memory: bool = True) -> Params:
-    """Return random parameters; with ``memory`` also the reader's, without effect at first.
-
-    A backbone that names no places has no reader.
-    """
+    """Return random parameters; with ``memory`` and injection points, also those of the reader."""
     backbone_key, memory_key = jax.random.split(key)
     frozen_key = jax.random.fold_in(key, 2)
     channels = model.in_channels, model.codec.channels
@@ -185,8 +170,8 @@ def apply(
         params: ``{"backbone": …, "memory": …}``.
         noisy_BthwC: (B, t, h, w, C) noisy colour and depth latents.
         conditioning: the observed frame, control and text.
-        time_B: (B,) noise level as the network sees it, or (B, t), one for each latent frame.
-        readout: what the memory shows each clip, leading axis B; None is the stage-1 model.
+        time_B: (B,) noise level in the network's units, or (B, t), one for each latent frame.
+        readout: the memory's readout, leading axis B; None is the stage-1 model.
 
     Returns:
         (B, t, h, w, C) float32 prediction.
@@ -204,10 +189,7 @@ def apply(
 
 
 def _seen(model: AssembledModel, latents_C: Array) -> Array:
-    """Set the depth channels of latents to zero if the denoiser works without depth.
-
-    The channels remain, so that both variants have the same parameters.
-    """
+    """Set the depth channels to zero, but keep them, if the denoiser works without depth."""
     if model.clip.depth:
         return latents_C
     colour = np.arange(latents_C.shape[-1]) < model.codec.rgb_channels
@@ -242,18 +224,17 @@ def sample(
     """Sample one batch of clips' latents with the configured noise and sampler.
 
     With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM
-    lets g vary with the step (``noise.dynamic_guidance``). Where ``blind`` is given, it is what the
-    prediction is compared with, in the place of the same without the map. Latents that the
-    conditioning knows are held: whatever is predicted there, x0 is what is known.
+    lets g vary with the step (``noise.dynamic_guidance``). ``blind`` replaces "no map". Where the
+    conditioning knows latents, x0 is the known value.
 
     Args:
         model: the model.
         params: the world model's parameters.
         conditioning: observed frame, control, text.
-        readout: what the memory shows the clips, or None for no memory.
+        readout: the memory's readout, or None for no memory.
         noise_BthwC: standard normal start.
         key: randomness of the steps, if the sampler draws noise.
-        blind: the conditioning without what guidance is to strengthen.
+        blind: the conditioning without the input that guidance strengthens.
 
     Returns:
         (B, t, h, w, C) latents.

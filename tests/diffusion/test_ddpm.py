@@ -13,6 +13,15 @@ from pewm_jax.worlds import objective, world_model
 from tests.helpers import TINY, init_world, random_frames, randomise, tiny_model
 
 
+def drawn(config, denoise, noise, key=None, **more):
+    """Sample with a denoiser that ignores the weight of guidance."""
+    return config.sample(lambda x, levels, _weight: denoise(x, levels), noise, key, **more)
+
+
+def dpm(**settings):
+    return DDPMConfig(sampler="dpm", **settings)
+
+
 def test_the_schedule_ends_in_pure_noise_and_falls():
     alphas = DDPMConfig().alphas_cumprod()
     assert alphas[-1] == 0
@@ -57,7 +66,7 @@ def test_ddim_with_a_perfect_denoiser_finds_the_truth(steps):
     config = DDPMConfig(sample_steps=steps)
     x0 = np.random.default_rng(0).normal(size=(2, 3)).astype(np.float32)
     noise = jax.random.normal(jax.random.key(0), (2, 3))
-    out = jax.jit(lambda n: config.ddim(lambda _x, _t: jnp.asarray(x0), n))(noise)
+    out = jax.jit(lambda n: drawn(config, lambda _x, _t: jnp.asarray(x0), n))(noise)
     np.testing.assert_allclose(out, x0, atol=1e-6)
 
 
@@ -72,7 +81,7 @@ def test_ddim_keeps_the_noise_of_its_path():
         jax.debug.callback(lambda a, b: seen.append((np.array(a), np.array(b))), x, times)
         return x0
 
-    jax.block_until_ready(config.ddim(denoise, noise))
+    jax.block_until_ready(drawn(config, denoise, noise))
     jax.effects_barrier()
     assert len(seen) == 10
     for x, times in seen:
@@ -197,24 +206,24 @@ def test_the_sampler_finds_the_mean_of_a_gaussian_whatever_the_network_predicts(
         return config.to_x0(asked, x, times)
 
     start, key = jax.random.normal(jax.random.key(0), (1, 4000)), jax.random.key(1)
-    out = config.ddim(denoise, start) if kind == "ddim" else config.dpm(denoise, start, key)
+    out = drawn(config, denoise, start, key)
     assert abs(float(out.mean()) - mean) < 0.03
     assert abs(float(out.std()) - spread) < 0.03
 
 
 def test_dpm_draws_its_noise_from_the_key_or_takes_it():
-    config = DDPMConfig(sample_steps=4)
+    config = dpm(sample_steps=4)
     start, key = jax.random.normal(jax.random.key(0), (2, 3)), jax.random.key(1)
     steps = jnp.stack([jax.random.normal(jax.random.fold_in(key, k), (2, 3)) for k in range(4)])
 
     def denoise(x, _times):
         return jnp.tanh(x)
 
-    by_key = config.dpm(denoise, start, key)
-    given = config.dpm(denoise, start, step_noise=steps)
+    by_key = drawn(config, denoise, start, key)
+    given = drawn(config, denoise, start, step_noise=steps)
     np.testing.assert_allclose(by_key, given, atol=1e-6)
-    assert np.abs(by_key - config.dpm(denoise, start, jax.random.key(2))).max() > 1e-3
-    path = config.dpm(denoise, start, key, every_step=True)
+    assert np.abs(by_key - drawn(config, denoise, start, jax.random.key(2))).max() > 1e-3
+    path = drawn(config, denoise, start, key, every_step=True)
     assert path.shape == (4, 2, 3)
     np.testing.assert_allclose(path[-1], by_key, atol=1e-6)
 
@@ -222,9 +231,10 @@ def test_dpm_draws_its_noise_from_the_key_or_takes_it():
 @pytest.mark.parametrize("more", [{}, {"key": jax.random.key(0), "step_noise": np.zeros((4, 2))}])
 def test_dpm_needs_a_key_or_noise(more):
     with pytest.raises(ValueError, match="give it a key"):
-        DDPMConfig(sample_steps=4).dpm(lambda x, _t: x, jnp.zeros((2,)), **more)
+        drawn(dpm(sample_steps=4), lambda x, _t: x, jnp.zeros((2,)), **more)
     with pytest.raises(ValueError, match=r"it needs \(4, 2\)"):
-        DDPMConfig(sample_steps=4).dpm(
+        drawn(
+            dpm(sample_steps=4),
             lambda x, _t: x,
             jnp.zeros((2,)),
             step_noise=np.zeros((3, 2)),
@@ -232,18 +242,16 @@ def test_dpm_needs_a_key_or_noise(more):
 
 
 def test_the_sample_has_the_precision_of_the_noise():
-    config, start = DDPMConfig(sample_steps=4), jnp.ones((1, 2), jnp.bfloat16)
-    for out in (
-        config.ddim(lambda x, _t: jnp.tanh(x), start),
-        config.dpm(lambda x, _t: jnp.tanh(x), start, jax.random.key(0)),
-    ):
+    start = jnp.ones((1, 2), jnp.bfloat16)
+    for config in (DDPMConfig(sample_steps=4), dpm(sample_steps=4)):
+        out = drawn(config, lambda x, _t: jnp.tanh(x), start, jax.random.key(0))
         assert out.dtype == jnp.bfloat16
 
 
 def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
     def path(steps, stride):
         config = DDPMConfig(sample_steps=steps, stride=stride)
-        return config.ddim(lambda x, _t: jnp.tanh(x), jnp.ones((1, 2)))
+        return drawn(config, lambda x, _t: jnp.tanh(x), jnp.ones((1, 2)))
 
     np.testing.assert_array_equal(path(10, "next"), path(10, "fixed"))
     assert np.abs(path(7, "next") - path(7, "fixed")).max() > 1e-4

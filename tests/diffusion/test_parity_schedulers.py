@@ -77,15 +77,12 @@ def their_path(theirs, steps, start, step_noise, monkeypatch):
 
 
 def our_path(config, start, step_noise):
-    def denoise(x, times):
+    def denoise(x, times, _weight):
         prediction = network(x, times.reshape(-1, 1, 1, 1), jnp)
         return config.to_x0(prediction, x, times)
 
-    if config.sampler == "ddim":
-        return jax.jit(lambda x: config.ddim(denoise, x, every_step=True))(start)
-
     def run(x, noise):
-        return config.dpm(denoise, x, step_noise=noise, every_step=True)
+        return config.sample(denoise, x, step_noise=noise, every_step=True)
 
     return jax.jit(run)(start, step_noise)
 

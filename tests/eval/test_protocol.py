@@ -27,10 +27,9 @@ from pewm_jax.eval.reproject import CANDIDATES, reproject
 from pewm_jax.geometry.actions import integrate
 from pewm_jax.io.store import file_hash
 from pewm_jax.memory.images import ImagesConfig
-from pewm_jax.memory.map2d import Map2DConfig
 from pewm_jax.memory.points import PointsConfig
 from pewm_jax.memory.surfels import SurfelConfig
-from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.memory.voxel_map import Map2DConfig, VoxelConfig
 from tests.eval.scene import record, tiny, write_split
 
 

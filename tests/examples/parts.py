@@ -16,7 +16,7 @@ from pewm_jax import worlds
 from pewm_jax.config import ClipConfig, Config, DataConfig, MeshConfig, StageConfig, TrainConfig
 from pewm_jax.data import abstract
 from pewm_jax.plan import measure
-from pewm_jax.readers.both import BothConfig
+from pewm_jax.readers.render import BothConfig
 from pewm_jax.train import sharding, step
 from pewm_jax.worlds.pewm.world import PEWM
 from tests.helpers import random_frames

@@ -13,10 +13,9 @@ import pewm_jax
 from pewm_jax.geometry import actions, cameras, plucker
 from pewm_jax.memory import interface as memories
 from pewm_jax.memory.images import ImagesConfig
-from pewm_jax.memory.map2d import Map2DConfig
 from pewm_jax.memory.points import PointsConfig
 from pewm_jax.memory.surfels import SurfelConfig
-from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.memory.voxel_map import Map2DConfig, VoxelConfig
 from pewm_jax.types import Camera, Frames
 from tests.helpers import random_camera, rigid, tiny_model
 from tests.properties import examples

@@ -18,11 +18,10 @@ from pewm_jax.geometry import cameras
 from pewm_jax.memory import cells, images, points, voxel_map
 from pewm_jax.memory import interface as memories
 from pewm_jax.memory.images import ImagesConfig
-from pewm_jax.memory.map2d import Map2DConfig
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.points import PointsConfig
 from pewm_jax.memory.surfels import SurfelConfig
-from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.memory.voxel_map import Map2DConfig, VoxelConfig
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds import world_model
 from tests.helpers import TINY, random_camera, random_frames, tiny_model, with_reader

@@ -19,7 +19,7 @@ from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
 from pewm_jax.plan import hlo, measure, suggest
 from pewm_jax.plan.measure import MeshSizes
 from pewm_jax.readers.attention import AttentionConfig
-from pewm_jax.readers.both import BothConfig
+from pewm_jax.readers.render import BothConfig
 from pewm_jax.worlds.pewm.world import PEWM, STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)

@@ -14,8 +14,7 @@ from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.readers import render as render_reader
 from pewm_jax.readers.attention import AttentionConfig
-from pewm_jax.readers.both import BothConfig
-from pewm_jax.readers.render import RenderConfig
+from pewm_jax.readers.render import BothConfig, RenderConfig
 from pewm_jax.types import Clip, Control, Frames, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm

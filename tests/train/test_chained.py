@@ -14,7 +14,7 @@ from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ConfigError, TrainConfig, UserError
 from pewm_jax.memory import interface as memories
-from pewm_jax.readers.both import BothConfig
+from pewm_jax.readers.render import BothConfig
 from pewm_jax.train import flops
 from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model

@@ -22,10 +22,9 @@ from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.io import tree, weights
 from pewm_jax.memory.images import ImagesConfig
-from pewm_jax.memory.map2d import Map2DConfig
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.points import PointsConfig
-from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.memory.voxel_map import Map2DConfig, VoxelConfig
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig

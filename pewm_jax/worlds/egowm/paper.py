@@ -6,10 +6,9 @@ import dataclasses
 import math
 from typing import Literal
 
-from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.experiment import Config
-from pewm_jax.config.mesh import MeshConfig
-from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig
+from pewm_jax.config.training import DataConfig, EvalConfig, MeshConfig, StageConfig
+from pewm_jax.config.world import ClipConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
@@ -39,8 +38,8 @@ def experiment(
 ) -> Config:
     """Return the settings of the paper on Stable Video Diffusion.
 
-    The paper's are the size, learning rates, motion bucket, noise on the image, guidance and number
-    of sampling steps; steps, batch, noise levels in training (those of Stable Video Diffusion) and
+    Size, learning rates, motion bucket, noise on the image, guidance and number of sampling steps
+    are the paper's; steps, batch, noise levels in training (those of Stable Video Diffusion) and
     the share of clips without the image are ours.
 
     Args:
@@ -84,21 +83,14 @@ def cosmos_experiment(
     clip: tuple[int, int, int] = COSMOS_CLIP,
     dtype: Literal["float32", "bfloat16"] = "bfloat16",
 ) -> Config:
-    """Return the settings of the paper on Cosmos-Predict2.
+    """Return the settings of the paper on Cosmos-Predict2; arguments as for ``experiment``.
 
-    The paper's are the clip, the learning rates, and the form of the actions' layers: two layers
-    and two convolutions over time, which are ten times as fast. Steps, batch and noise levels in
-    training are ours; of guidance it says nothing, so there is none. The observed frame gets no
-    noise. The paper does not state Adam's decays; they are those of Cosmos-Predict2's own training
-    (0.9 and 0.99, cosmos-predict2 ``cosmos_predict2/configs/base/defaults/optimizer.py``).
-
-    Args:
-        transformer: the network.
-        vae: its autoencoder.
-        noise: its scheduler.
-        run: name of the experiment, for the folder of its runs.
-        clip: frames, height and width.
-        dtype: precision of the computation.
+    The clip (frames, height, width), the learning rates, and the form of the actions' layers (two
+    layers and two convolutions over time, ten times as fast) are the paper's. Steps, batch and
+    noise levels in training are ours; there is no guidance, which the paper does not mention, and
+    no noise on the observed frame. Adam's decays, which the paper does not state, are those of
+    Cosmos-Predict2's own training (0.9 and 0.99,
+    ``cosmos_predict2/configs/base/defaults/optimizer.py``).
     """
     frames, height, width = clip
     return Config(

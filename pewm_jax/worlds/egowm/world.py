@@ -138,8 +138,8 @@ class EgoWM(AssembledModel):
     def stages(self) -> tuple[Stage, ...]:
         """Return the two stages.
 
-        In ``video`` the backbone becomes a video model; the control is frozen, and has no effect at
-        first. In ``adapt`` all of the backbone is trained further, with actions.
+        ``video`` trains the backbone as a video model; the control is frozen, and has no effect at
+        first. ``adapt`` trains backbone and control, with actions.
         """
         video = Stage(
             name="video",
@@ -161,16 +161,13 @@ class EgoWM(AssembledModel):
         return video, adapt
 
     def start(self, params: Params, frames: Frames) -> WorldState:
-        """Begin a world; see ``worlds.start``.
-
-        If there are fewer frames than ``history``, the first is repeated.
-        """
+        """Begin a world; if there are fewer frames than ``history``, the first is repeated."""
         del params
         checks.require_frames(self, frames, "start")
         return self._state(jax.tree.map(jnp.asarray, as_signal(frames)))
 
     def observe(self, params: Params, state: WorldState, frames: Frames) -> WorldState:
-        """Observe real frames; see ``worlds.observe``."""
+        """Observe real frames."""
         del params
         checks.require_frames(self, frames, "observe")
         return self._state(_joined(state.map, state.frame, as_signal(frames)))
@@ -185,10 +182,10 @@ class EgoWM(AssembledModel):
         remember: bool = True,
         memory: bool = True,
     ) -> tuple[WorldState, Frames]:
-        """Imagine chunk after chunk; see ``worlds.imagine``.
+        """Imagine chunk after chunk; there is no memory to ignore.
 
-        There is no memory to ignore. Without ``remember`` the state keeps its frames before the
-        present one; with a ``history`` of 1 there are none, and the results are the same.
+        Without ``remember`` the state keeps its frames before the present one; with a ``history``
+        of 1 there are none, and the results are the same.
         """
         del memory
         asked = control_of(self, state.frame.camera, control)
@@ -211,13 +208,12 @@ class EgoWM(AssembledModel):
         return after, join_clips(frames, count)
 
     def imagine_chunk(self, params: Params, past: Frames, control: Control, key: Array) -> Frames:
-        """Imagine one chunk.
+        """Imagine one chunk of n = clip.frames − history frames.
 
         Args:
             params: the world model's parameters.
             past: (history) frames before it, colours float in [−1, 1]; the last one is the present.
-            control: (n) cameras of the frames to imagine, with n = clip.frames − history, and
-                actions that lead to them.
+            control: (n) cameras of the frames to imagine, and actions that lead to them.
             key: randomness of the noise.
 
         Returns:

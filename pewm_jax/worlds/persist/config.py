@@ -1,4 +1,4 @@
-"""Settings of PERSIST, as the modules of this folder use them; ``world.py`` has its methods."""
+"""Settings of PERSIST; ``world.py`` has its methods."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pewm_jax.config import (
     StageConfig,
     TrainSettings,
 )
-from pewm_jax.errors import require
+from pewm_jax.errors import require, require_fields
 from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.models.persist.nets import PersistNetsConfig
 from pewm_jax.registry import part
@@ -176,9 +176,8 @@ class PersistModel(AssembledModel):
                 f"model.{name}.per_frame is false, and every frame of this world has a time of its "
                 "own: use true.",
             )
-        for name in ("persistence_logit", "empty_prior", "observation_logit"):
-            value = getattr(self, name)
-            require(value >= 0, f"model.{name} is {value}: use 0 or more nats.")
+        logits = ("persistence_logit", "empty_prior", "observation_logit")
+        require_fields(self, "model", lambda value: value >= 0, "0 or more nats", *logits)
         for name in ("points", "observation_logit"):
             require(
                 self.clip.depth or not getattr(self, name),

@@ -1,9 +1,9 @@
 """The losses of PERSIST's networks, one for each stage (arXiv 2603.03482).
 
-``voxel_vae`` reconstructs grids; ``world_frames`` and ``renderer`` learn the velocity of latents at
-a time of each frame's own; ``camera`` learns the steps between cameras. All are functions of
-arrays, leading axis B. In ``actions_BTA`` row t is the action that leads to frame t, zeros for the
-first; ``led_to`` makes them from recorded ones, which lead away.
+``voxel_vae`` reconstructs grids; ``world_frames`` and ``renderer`` learn the velocity of latents,
+with a time for each frame; ``camera`` learns the steps between cameras. All are functions of arrays
+with a leading axis B. In ``actions_BTA`` row t is the action that leads to frame t, zeros for the
+first; ``led_to`` computes them from recorded ones, which lead away.
 """
 
 from __future__ import annotations
@@ -43,12 +43,9 @@ def led_to(actions_BTA: Array) -> Array:
 
 
 def previous(frames: Any) -> Any:
-    """Return what each frame is shown of another kind: that of the frame before it.
+    """Return for each frame of (B, T, …) arrays the value of the frame before.
 
-    The first frame has its own, from which a world can begin (w₀ from o₀).
-
-    Args:
-        frames: a tree of arrays (B, T, …).
+    The first frame keeps its own, from which a world can begin (w₀ from o₀).
     """
     return jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x[:, :-1]], 1), frames)
 
@@ -80,8 +77,8 @@ def world_frames(
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of voxel frames.
 
-    What is not known of a frame is noise alone, whatever the frame's time; later frames do not
-    read it, and its error does not count.
+    Unknown latents of a frame are noise at any time; later frames do not read them, and their error
+    does not count.
 
     Args:
         config: the network.
@@ -89,12 +86,12 @@ def world_frames(
         params: the network's parameters.
         latents_BTxyzC: normalised latents of voxel frames.
         actions_BTA: the action that leads to each frame.
-        pixels_BThwC: latents of the picture at each frame; see ``previous``.
-        key: randomness of times, noise and of what is hidden.
+        pixels_BThwC: latents of the image at each frame; see ``previous``.
+        key: randomness of times, noise and hidden images.
         camera_BTN: numbers of the camera at each frame.
-        blind: share of frames after the first that are not shown a picture.
-        known_BTxyz: bool, which latents a world would know at that frame; None for all.
-        weight_BTxyz: what the error of each latent counts; None for 1.
+        blind: share of frames after the first that are not conditioned on an image.
+        known_BTxyz: bool, the latents that a world would know at that frame; None for all.
+        weight_BTxyz: weight of each latent's error; None for 1.
         compare: an error of the predicted x0 that is added; see ``Compare``.
         dtype: of the computation.
     """
@@ -137,8 +134,8 @@ def camera(
 ) -> tuple[Array, Measured]:
     """Return the mean squared error of the steps between cameras, in ``config.units``.
 
-    Where the grid of a frame lies says where the agent has gone. So a camera's position is counted
-    from the middle of its own frame's grid, and not of the grid that the step leads to.
+    The position of a grid tells where the agent has gone. A camera's position is therefore relative
+    to the middle of its own frame's grid, not of the grid that the step leads to.
 
     Args:
         config: the network.
@@ -147,13 +144,12 @@ def camera(
         middle_BT3: the middle of each frame's grid, metres.
         cameras: (B, T) cameras.
         actions_BTA: the action that leads to each frame.
-        width: of the images that the cameras' intrinsics are for, pixels.
-        reckoned_BT6: steps to which the network adds what it says, each to its frame; None for
-            none.
+        width: of the images of the cameras' intrinsics, pixels.
+        reckoned_BT6: steps to each frame, to which the network's output is added; None for none.
         dtype: of the computation.
 
     Returns:
-        ``(loss, {"metres_off", "radians_off"})``: mean lengths of what is wrong.
+        ``(loss, {"metres_off", "radians_off"})``: mean lengths of the errors.
     """
     before, after = (
         jax.tree.map(lambda x, c=c: x[:, c], cameras) for c in (slice(-1), slice(1, None))
@@ -184,14 +180,14 @@ def renderer(
     drawn_BThwC: Array | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
-    """Return the squared error of the velocity of pictures' latents.
+    """Return the squared error of the velocity of the images' latents.
 
     Args:
         config: the network.
         noise: times and noise.
-        params: the network's parameters; the folding of the layers learns with the rest.
-        latents_BThwC: latents of pictures.
-        layers: (B, T, h, w, L) what their rays meet, from ``voxel_renderer.cast_rays``.
+        params: the network's parameters.
+        latents_BThwC: latents of images.
+        layers: (B, T, h, w, L) hits of their rays, from ``voxel_renderer.cast_rays``.
         key: randomness of times and noise.
         actions_BTA: the action that leads to each frame, where the network takes one.
         drawn_BThwC: latents of the drawn voxels, where the network takes them.
@@ -215,19 +211,7 @@ def _velocity(
     counts: Array | None = None,
     compare: Compare | None = None,
 ) -> tuple[Array, Measured]:
-    """Return the squared error at times drawn for each frame, and that of x0.
-
-    Args:
-        noise: times and noise.
-        predict: ``(x_t, times_BT) -> velocity``.
-        x0: (B, T, …) clean latents.
-        key: randomness.
-        dtype: of the computation.
-        known: bool, in the shape of x0 without its channels: elsewhere x_t is noise alone, and
-            the error does not count.
-        counts: in the same shape, what the error counts there; None for 1.
-        compare: an error of the predicted x0 that is added.
-    """
+    """Return the squared error of velocities and of x0, at times drawn for each frame."""
     time_key, noise_key = jax.random.split(key)
     times = noise.draw(time_key, *x0.shape[:2])
     times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], x0.shape[:2])
@@ -267,16 +251,16 @@ def compared(
     """Return the cross-entropy of the cells of latents that are drawn by their weight.
 
     Args:
-        config: the autoencoder, such as ``PersistTrainConfig.classes`` needs.
+        config: the autoencoder, one that ``PersistTrainConfig.classes`` accepts.
         params: its parameters.
         latents_BTxyzC: normalised latents.
-        classes_BTXYZ: int class ids of the cells, below 0 where they are not known.
-        weight_BTxyz: what each latent counts; 0 for those that are never drawn.
+        classes_BTXYZ: int class ids of the cells, below 0 if unknown.
+        weight_BTxyz: weight of each latent; those with 0 are never drawn.
         count: latents drawn of each frame.
-        key: draws them.
+        key: randomness of the choice.
 
     Returns:
-        ``(error, right)``: () nats of a cell, () the share of cells whose class is the likeliest.
+        ``(error, right)``: () nats per cell, () the share of cells whose class is the likeliest.
     """
     frames, side = latents_BTxyzC.shape[0] * latents_BTxyzC.shape[1], config.latent_side
     flat = latents_BTxyzC.reshape(frames, side**3, -1)
@@ -309,11 +293,11 @@ def error_of(
         config: the autoencoder.
         params: its parameters.
         latents_NC: normalised latents.
-        classes_NK: class ids of the cells of each; those below 0 do not count.
+        classes_NK: class ids of the cells of each; ids below 0 do not count.
 
     Returns:
-        ``(error_N, right_N)``: its mean over the known cells of a latent, in nats, and the share of
-        those whose class is the likeliest.
+        ``(error_N, right_N)``: the mean over the known cells of a latent, in nats, and the share of
+        them whose class is the likeliest.
     """
     alone = dataclasses.replace(config, side=config.factor, cube=0, slab=0)
     scores = voxel_vae_model.logits(alone, params, latents_NC[:, None, None, None])

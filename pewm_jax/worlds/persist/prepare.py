@@ -1,7 +1,7 @@
-"""What each stage of the world ``persist`` is given of a batch of clips.
+"""The inputs of each stage of the world ``persist``, computed from a batch of clips.
 
-It is computed with frozen weights, once where ``data.prepared`` asks for it; The clip's extra
-``prepared`` holds it. The voxels of a clip are seen in windows, as in a rollout.
+They are computed with frozen weights, only once with ``data.prepared``, and stored in the clip's
+extra ``prepared``. The voxels of a clip are cut into windows, as in a rollout.
 """
 
 from __future__ import annotations
@@ -26,17 +26,16 @@ from pewm_jax.worlds.persist.step import drawn
 
 
 def lattice(model: PersistModel, clip: Clip) -> tuple[Array, Array]:
-    """Return where the recorded grids begin, and the windows of their frames, in whole cells.
+    """Return the first cells of the recorded grids, and of the windows of their frames.
 
-    Windows begin at whole tokens of a lattice. A rollout's lies where its first frame was, so each
-    clip has another, by the cell where it begins.
+    Windows begin at whole tokens of a lattice. A rollout's lattice begins at its first frame; here
+    each clip gets its own, which depends on the cell where it begins.
 
     Returns:
-        ``(recorded_BT3, start_BT3)``: int32 cells, counted from a corner that a clip's frames have
-        in common.
+        ``(recorded_BT3, start_BT3)``: int32 cells, relative to one corner for all frames of a clip.
 
     Raises:
-        UserError: the data have no voxels, no actions, or grids of another size.
+        UserError: see ``require_recorded``.
     """
     require_recorded(model, clip)
     size = grid_state.cell_m(model)
@@ -54,7 +53,7 @@ def lattice(model: PersistModel, clip: Clip) -> tuple[Array, Array]:
 
 
 def _mixed(cell_BT3: Array) -> Array:
-    """Return two numbers and 0 of a cell that tell nothing of it: a clip's own, without a key."""
+    """Return two pseudo-random numbers, which depend on a cell, and 0."""
     x, y, _ = jnp.moveaxis(cell_BT3.astype(jnp.uint32), -1, 0)
     mixed = (x * jnp.uint32(0x9E3779B1)) ^ (y * jnp.uint32(0x85EBCA6B))
     mixed = (mixed ^ (mixed >> 15)) * jnp.uint32(0xC2B2AE35)
@@ -63,7 +62,7 @@ def _mixed(cell_BT3: Array) -> Array:
 
 
 def cut(model: PersistModel, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
-    """Return (B, T, X, Y, Z) int16 windows of the recorded grids, unknown where they reach out."""
+    """Return (B, T, X, Y, Z) int16 windows of the recorded grids; cells outside are unknown."""
     classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
     one = functools.partial(grid_state.cut, count=grid_state.side(model))
     return jax.vmap(jax.vmap(one))(classes, start_BT3 - recorded_BT3)
@@ -72,7 +71,7 @@ def cut(model: PersistModel, clip: Clip, start_BT3: Array, recorded_BT3: Array) 
 def pictures(
     model: PersistModel, params: Params, clip: Clip
 ) -> tuple[Array, grid_state.ShownPicture]:
-    """Return (B, T, h, w, C) latents of the frames, and the same as voxel frames are shown them."""
+    """Return (B, T, h, w, C) latents of the frames, and as the conditioning of voxel frames."""
     frames = as_signal(clip.frames)
     latents = rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     latents = latents[..., : model.picture_channels]
@@ -90,7 +89,7 @@ def grids(model: PersistModel, params: Params, clip: Clip) -> Clip:
 
 
 def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
-    """Return latents of voxel frames, all in the window of the last one, and their conditions."""
+    """Return latents of voxel frames, all in the window of the last one, and their conditioning."""
     recorded, start = lattice(model, clip)
     last = jnp.broadcast_to(start[:, -1:], start.shape)
     classes = cut(model, clip, last, recorded)
@@ -131,7 +130,7 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
 
 
 def occupied(model: PersistModel, classes_BTXYZ: Array) -> Array:
-    """Return (B, T, x, y, z) bool: whether anything is known to be in the cells of a latent."""
+    """Return (B, T, x, y, z) bool: whether a known cell of a latent is occupied."""
     *front, wide, _, _ = classes_BTXYZ.shape
     factor = model.backbone.voxel_vae.factor
     count = wide // factor
@@ -140,7 +139,7 @@ def occupied(model: PersistModel, classes_BTXYZ: Array) -> Array:
 
 
 def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
-    """Return the voxels around where the camera was before each frame, and the cameras."""
+    """Return the voxels around the previous camera of each frame, and the cameras."""
     del params
     recorded, _ = lattice(model, clip)
     size, config = grid_state.cell_m(model), model.backbone.camera_model
@@ -161,7 +160,7 @@ def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
 
 
 def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
-    """Return latents of the pictures, and what their rays meet in the true voxels."""
+    """Return latents of the images, and the hits of their rays in the true voxels."""
     recorded, start = lattice(model, clip)
     classes = jnp.maximum(cut(model, clip, start, recorded), 0)
     size = grid_state.cell_m(model)
@@ -191,11 +190,7 @@ def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
 
 
 def require_recorded(model: PersistModel, clip: Clip) -> None:
-    """Refuse data without what this world learns from.
-
-    Raises:
-        UserError: no voxels, no actions, or grids of another size.
-    """
+    """Refuse data without voxels or actions, or with grids of another size."""
     memory, classes = model.memory, clip.extras.get("classes_TXYZ")
     groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"
     command = (
@@ -214,7 +209,7 @@ def require_recorded(model: PersistModel, clip: Clip) -> None:
 
 
 def _prepared(clip: Clip, made: Any) -> Clip:
-    """Return a clip of what was made of it alone; arrays that are not used any more are empty."""
+    """Return a clip with these values as ``prepared``; arrays that are no longer used are empty."""
 
     def none(x: Any) -> Any:
         return jax.tree.map(lambda leaf: leaf[:, :0], x)

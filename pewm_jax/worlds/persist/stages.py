@@ -26,7 +26,7 @@ SMALL = 1e-4
 
 
 def init(model: PersistModel, key: Array, networks: int = len(persist_nets.NETWORKS)) -> Params:
-    """Return random parameters of the codec and of the first so many networks."""
+    """Return random parameters of the codec and of the first ``networks`` networks."""
     codec_key, key = jax.random.split(key)
     names = persist_nets.NETWORKS[:networks]
     made = {"codec": model.codec.init(codec_key)}
@@ -36,7 +36,7 @@ def init(model: PersistModel, key: Array, networks: int = len(persist_nets.NETWO
 def _of(
     prepare: Callable[..., Clip], model: PersistModel, params: Params, clip: Clip
 ) -> dict[str, Any]:
-    """Return what a stage is given of a batch, prepared now if it was not before."""
+    """Return a stage's inputs, prepared now if they were not before."""
     if "prepared" not in clip.extras:
         clip = prepare(model, jax.lax.stop_gradient(params), clip)
     return clip.extras["prepared"]
@@ -149,7 +149,7 @@ def renderer(
 def _stage(
     number: int, name: str, trained: str, networks: int, loss: Any, prepare: Any, **more: Any
 ) -> Stage:
-    """Return a stage that trains what a pattern names, all else frozen."""
+    """Return a stage that trains the parameters of a pattern; all others are frozen."""
     return Stage(
         name=name,
         number=number,

@@ -1,8 +1,8 @@
-"""The state of the world ``persist``: windows of its grid, and what its networks keep of them.
+"""The state of the world ``persist``: windows of its grid, and the caches of its networks.
 
 A voxel frame is a window of the world's grid around the agent. It moves by whole tokens of the
-transformer, so that most steps leave it where it is, and so that the networks' caches move with it
-exactly. Cells that come into it and were never near the agent are unknown.
+transformer, so that most steps do not move it, and so that the networks' caches move with it
+exactly. Cells that enter the window for the first time are unknown.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ LONGEST_M, SHORTEST_M = 24.0, 1.5
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ShownPicture:
-    """A picture as voxel frames are shown it.
+    """An image as the conditioning of voxel frames.
 
     Attributes:
         latents_hwC: (..., h, w, C) its latents.
-        depth_hw: (..., h, w) mean depth of what was measured there, metres; 0 where nothing was.
+        depth_hw: (..., h, w) mean measured depth of each latent, metres; 0 without measurement.
         camera: (...) its camera.
     """
 
@@ -52,12 +52,9 @@ def side(model: PersistModel) -> int:
 
 
 def first_cell(model: PersistModel, low_3: Array, position_3: Array) -> Array:
-    """Return the first cell (3,) of the window around a position, in a world's grid.
+    """Return the first cell (3,) of the window around a position, relative to the world's grid.
 
-    Args:
-        model: the model.
-        low_3: lowest corner of the world's grid, metres.
-        position_3: the agent's camera, metres.
+    ``low_3`` is the lowest corner of the grid and ``position_3`` the agent's camera, metres.
     """
     token, wide = model.backbone.token_cells, side(model)
     cell = jnp.floor((position_3 - low_3) / cell_m(model)).astype(jnp.int32)
@@ -77,15 +74,16 @@ def window(model: PersistModel, classes_XYZ: Array, start_3: Array) -> Array:
 
 
 def written(classes_XYZ: Array, window_XYZ: Array, start_3: Array) -> Array:
-    """Return the world's grid with a window put into it."""
+    """Return the world's grid with a window written into it."""
     made = window_XYZ.astype(classes_XYZ.dtype)
     return jax.lax.dynamic_update_slice(classes_XYZ, made, tuple(start_3))
 
 
-def cut(classes_XYZ: Array, start_3: Array, count: int) -> Array:
-    """Return a cube of ``count`` cells that may reach out of a grid, unknown there."""
-    for axis, start in enumerate(start_3):
-        index = start + jnp.arange(count)
+def cut(classes_XYZ: Array, start_3: Array, count: int | tuple[int, ...]) -> Array:
+    """Return a box of ``count`` cells along each axis; cells outside the grid are unknown."""
+    counts = (count,) * 3 if isinstance(count, int) else count
+    for axis, (start, length) in enumerate(zip(start_3, counts, strict=True)):
+        index = start + jnp.arange(length)
         size = classes_XYZ.shape[axis]
         found = jnp.take(classes_XYZ, jnp.clip(index, 0, size - 1), axis=axis)
         inside = (index >= 0) & (index < size)
@@ -95,7 +93,7 @@ def cut(classes_XYZ: Array, start_3: Array, count: int) -> Array:
 
 
 def known_latents(model: PersistModel, classes_XYZ: Array) -> Array:
-    """Return (x, y, z) bool: the latents of whose token all cells are known."""
+    """Return (x, y, z) bool: the latents of tokens whose cells are all known."""
     token, wide = model.backbone.token_cells, side(model)
     patch, count = model.backbone.world_frames.patch, wide // token
     known = (classes_XYZ != UNKNOWN).reshape(count, token, count, token, count, token)
@@ -103,14 +101,14 @@ def known_latents(model: PersistModel, classes_XYZ: Array) -> Array:
 
 
 def spread(known_xyz: Array, patch: int) -> Array:
-    """Repeat what is said of tokens for all their latents."""
+    """Repeat the values of tokens for all their latents."""
     for axis in (-3, -2, -1):
         known_xyz = jnp.repeat(known_xyz, patch, axis)
     return known_xyz
 
 
 def moved(model: PersistModel, cache: FrameCache, before_3: Array, after_3: Array) -> FrameCache:
-    """Return what is kept of voxel frames for a window that has moved; nothing of new cells."""
+    """Return the cache of voxel frames for a window that has moved; new cells have no entries."""
     token = model.backbone.token_cells
     count = side(model) // token
     tokens = (after_3 - before_3) // token
@@ -129,11 +127,11 @@ def moved(model: PersistModel, cache: FrameCache, before_3: Array, after_3: Arra
 
 
 def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> ShownPicture:
-    """Return what is shown of pictures, any leading shape.
+    """Return images as conditioning, any leading shape.
 
     Args:
-        latents_hwC: (..., h, w, C) the pictures' latents.
-        depth_HW: (..., H, W) their depth, metres, 0 where it is not known.
+        latents_hwC: (..., h, w, C) the images' latents.
+        depth_HW: (..., H, W) their depth, metres, 0 if unknown.
         camera: (...) their cameras.
     """
     rows, columns = latents_hwC.shape[-3:-1]
@@ -145,12 +143,10 @@ def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> ShownPictur
 
 
 def picture_channels(model: PersistModel, shown: ShownPicture, middle_3: Array) -> Array:
-    """Return the channels of pictures as voxel frames are shown them, (..., h, w, C).
+    """Return the channels (..., h, w, C) by which images condition voxel frames.
 
-    Args:
-        model: the model.
-        shown: the pictures.
-        middle_3: (..., 3) the middle of the window, metres, from which places are counted.
+    With ``model.points``, positions are relative to ``middle_3``, (..., 3) the middle of the
+    window, metres.
     """
     if not model.points:
         return shown.latents_hwC
@@ -176,17 +172,17 @@ def middle(model: PersistModel, low_3: Array, start_3: Array) -> Array:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class History:
-    """What the networks keep of the frames so far.
+    """The networks' caches of the frames so far.
 
-    The present voxel frame is not in ``voxels`` yet: it is encoded anew when the next one is made,
-    so that what was edited counts.
+    The present voxel frame is not in ``voxels`` yet: it is encoded when the next one is sampled, so
+    that edits have an effect.
 
     Attributes:
         voxels: of the world frames' transformer, up to the frame before the present one.
         cameras: of the camera model, up to the present frame.
         pictures: of the renderer, up to the present frame.
         action_A: the action that led to the present frame.
-        shown: the picture that the present voxel frame was shown.
+        shown: the image that conditioned the present voxel frame.
         start_3: int32, first cell of the present window in the world's grid.
     """
 
@@ -205,7 +201,7 @@ class Past:
 
     Attributes:
         grid: the world's voxels, with their ``History``.
-        shown: the present picture as the next voxel frame is shown it.
+        shown: the present image as conditioning of the next voxel frame.
     """
 
     grid: ClassGrid
@@ -215,14 +211,14 @@ class Past:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class KnownFrame:
-    """What is known of the frame that a step leads to; None is made by the networks.
+    """The known parts of the frame that a step leads to; the networks predict those that are None.
 
     Attributes:
         camera: its camera.
         rgb_HWC: its colours in [−1, 1], with ``depth_HW``.
         depth_HW: its depth, metres.
         classes_XYZ: its voxels, a window at ``start_3``.
-        start_3: int32, where that window begins in the world's grid.
+        start_3: int32, first cell of that window in the world's grid.
     """
 
     camera: Camera | None = None
@@ -233,13 +229,13 @@ class KnownFrame:
 
 
 def encoded(model: PersistModel, params: Params, rgb_HWC: Array, depth_HW: Array) -> Array:
-    """Return the latents (h, w, C) of a picture: those of its depth with them, if it has any."""
+    """Return the latents (h, w, C) of an image, with those of its depth, if it has any."""
     both = rgbd.encode_rgbd(model, params, rgb_HWC[None, None], depth_HW[None, None])
     return both[0, 0, ..., : model.picture_channels]
 
 
 def decoded(model: PersistModel, params: Params, latents_hwC: Array) -> tuple[Array, Array]:
-    """Return colours (H, W, 3) and depth (H, W) of a picture's latents; depth 0 without any."""
+    """Return colours (H, W, 3) and depth (H, W), 0 if unknown, of an image's latents."""
     missing = model.codec.channels - latents_hwC.shape[-1]
     latents = jnp.pad(latents_hwC, ((0, 0), (0, 0), (0, missing)))
     rgb, depth = rgbd.decode_rgbd(model, params, latents[None, None])
@@ -247,7 +243,7 @@ def decoded(model: PersistModel, params: Params, latents_hwC: Array) -> tuple[Ar
 
 
 def context(noise: Noise, x0: Array, key: Array) -> tuple[Array, Array]:
-    """Return frames (1, 1, …) with the noise that given ones have, and their times."""
+    """Return known frames (1, 1, …) with the noise of ``context_noise``, and their times."""
     times = jnp.full(x0.shape[:2], getattr(noise, "context_noise", 0.0))
     drawn = jax.random.normal(key, x0.shape, x0.dtype)
     return noise.corrupt(x0, drawn, times), times

@@ -1,6 +1,6 @@
-"""One step of the world ``persist``: voxels, camera, features, picture (arXiv 2603.03482).
+"""One step of the world ``persist``: voxels, camera, features, image (arXiv 2603.03482).
 
-Frames come one by one, so arrays have no batch; the networks are given one of 1.
+Frames are processed one by one, so arrays have no batch axis; the networks get one of 1.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from pewm_jax.worlds.persist.voxel_frames import ObservedCells
 
 
 def reckoned(model: PersistModel, here: Camera, action_A: Array) -> Camera:
-    """Return about where an action leads, to lay the window there: planar ones alone say."""
+    """Return the camera that a planar action leads to; the present camera for other actions."""
     if model.control.actions != 3:
         return here
     return Camera(here.intrinsics_4, step_pose(here.world_from_camera, action_A))
 
 
 def reckoning(model: PersistModel, actions_A: Array) -> Array:
-    """Return the steps (..., 6) to which the camera model adds what it says."""
+    """Return the steps (..., 6) to which the camera model's output is added."""
     if not model.dead_reckoning:
         return jnp.zeros((*actions_A.shape[:-1], CAMERA_STEP_NUMBERS))
     dx, dy, turn = jnp.moveaxis(actions_A, -1, 0)
@@ -52,7 +52,7 @@ def next_camera(
     action_A: Array,
     cache: FrameCache,
 ) -> tuple[Camera, FrameCache]:
-    """Return where the camera goes, given the voxels around where it is."""
+    """Return the next camera, predicted from the voxels around the present one."""
     config = model.backbone.camera_model
     place, size = here.world_from_camera[:3, 3], grid_state.cell_m(model)
     cell = jnp.floor((place - low_3) / size).astype(jnp.int32)
@@ -79,7 +79,7 @@ def features(
     start_3: Array,
     camera: Camera,
 ) -> Array:
-    """Return what the camera sees of a window, (1, 1, h, w, F); no gradient goes through rays."""
+    """Return the features (1, 1, h, w, F) of a window seen by a camera; rays have no gradient."""
     config = model.backbone.renderer
     camera = jax.lax.stop_gradient(camera)
     corner = low_3 + start_3 * grid_state.cell_m(model)
@@ -105,12 +105,7 @@ def drawn(
 ) -> Array:
     """Return latents (h, w, C) of a window drawn in the colours of its classes, without light.
 
-    Args:
-        model: the model.
-        params: gives the codec.
-        classes_XYZ: the window's cells.
-        corner_3: its lowest corner, metres.
-        camera: one camera.
+    ``corner_3`` is the window's lowest corner, metres.
     """
     cells = ClassGrid(classes_XYZ, corner_3)
     one = jax.tree.map(lambda x: x[None], camera)
@@ -127,7 +122,7 @@ def sample(
     cache: FrameCache,
     key: Array,
 ) -> Array:
-    """Sample the latents (h, w, C) of a picture of the voxels."""
+    """Sample the latents (h, w, C) of an image of the voxels."""
     config, noise = model.backbone.renderer, model.noise
     shape = (1, 1, config.height, config.width, config.latent_channels)
 
@@ -149,7 +144,7 @@ def remembered(
     cache: FrameCache,
     key: Array,
 ) -> FrameCache:
-    """Add a picture to the renderer's cache."""
+    """Add an image to the renderer's cache."""
     x, times = context(model.noise, latents_hwC[None, None], key)
     return _render(model, params, x, times, features, action_A, cache)[1]
 
@@ -185,15 +180,15 @@ def begin(
     *,
     real: bool = True,
 ) -> Past:
-    """Return the world at its first frame; where nothing is known of its window, w₀ is generated.
+    """Return the world at its first frame (1,); unknown cells of its window are generated.
 
     Args:
         model: the model.
         params: all parameters.
-        grid: what is known of the world.
+        grid: the known part of the world.
         frame: (1,) the first frame, colours in [−1, 1].
         key: randomness of w₀.
-        real: whether the frame is real, and shows what is there (``model.observation_logit``).
+        real: whether the frame is real, and so is evidence (``model.observation_logit``).
     """
     camera = jax.tree.map(lambda x: x[0], frame.camera)
     latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
@@ -236,7 +231,7 @@ def step(
     key: Array,
     known: KnownFrame | None = None,
 ) -> tuple[Past, Frames]:
-    """Carry the world on by one frame.
+    """Advance the world by one frame, and return it with the frame, (1,).
 
     Args:
         model: the model.
@@ -244,10 +239,7 @@ def step(
         past: the world so far.
         action_A: the action that leads to the frame.
         key: randomness.
-        known: what is known of the frame.
-
-    Returns:
-        The world after it, and the frame, (1,).
+        known: the known parts of the frame.
     """
     known = KnownFrame() if known is None else known
     grid, history, here = past.grid, past.grid.history, past.shown.camera
@@ -301,7 +293,7 @@ def _sight(
     depth_HW: Array,
     camera: Camera,
 ) -> ObservedCells | None:
-    """Return what a real picture shows of the window's cells, where the model looks."""
+    """Return the evidence of a real image, if ``model.observation_logit`` uses it."""
     if not model.observation_logit:
         return None
     corner = grid.low_3 + start_3 * grid_state.cell_m(model)

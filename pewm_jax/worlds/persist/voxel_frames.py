@@ -1,14 +1,13 @@
-"""Voxel frames of the world ``persist``: how the next one is sampled (arXiv 2603.03482).
+"""Voxel frames of the world ``persist``: sampling of the next one (arXiv 2603.03482).
 
-The present voxels, as they are now, are encoded again and enter the transformer's cache. The next
-ones are sampled from noise; a class that a cell has had is preferred by
-``model.persistence_logit``.
+The present voxels are encoded and enter the transformer's cache. The next ones are sampled from
+noise; ``model.persistence_logit`` favours the previous class of a cell.
 
-In a world of blocks (``memory.pictures cells``) a real picture says more, without a network: its
-depth shows which cells are empty and which hold a surface, and a surface has the colour of the
-picture without the light on it. ``model.observation_logit`` is the advantage, in nats, that this
-gives a class when voxels are sampled for a real frame. Imagined frames are made of the voxels, so
-nothing is concluded from them. Not as published.
+In a world of blocks (``memory.pictures cells``) a real image is further evidence, without a
+network: its depth shows which cells are empty and which hold a surface, and a surface has the
+image's colour without the light on it. ``model.observation_logit`` is the advantage, in nats, that
+such evidence gives a class when voxels are sampled for a real frame. Imagined frames are rendered
+from the voxels, so they are no evidence. Not as published.
 """
 
 from __future__ import annotations
@@ -49,13 +48,13 @@ def sample(
     Args:
         model: the model.
         params: all parameters.
-        history: gives the action that leads to the frame, and the picture that it is shown.
+        history: gives the action that leads to the frame, and the image that conditions it.
         cache: of the frames before it.
         middle_3: the middle of its window, metres.
         before_XYZ: the window's cells before; ``model.persistence_logit`` applies where they are
             known.
         key: randomness.
-        evidence: what a real picture of this frame shows of the window's cells.
+        evidence: what a real image of this frame shows of the window's cells.
     """
     config, noise = model.backbone.world_frames, model.voxel_noise
     asked = _asked(model, history, middle_3)
@@ -82,11 +81,11 @@ def decode_classes(
     before_XYZ: Array,
     evidence: ObservedCells | None = None,
 ) -> Array:
-    """Return the class ids (X, Y, Z) that latents (1, …) decode to.
+    """Return the class ids (X, Y, Z) of latents (1, …).
 
     A cell whose class was known changes only if another class is likelier by
     ``model.persistence_logit``. An unknown cell is empty unless a class is likelier by
-    ``model.empty_prior``. ``model.observation_logit`` is added to the class that a real picture
+    ``model.empty_prior``. ``model.observation_logit`` is added to the class that a real image
     shows.
     """
     config = model.backbone.voxel_vae
@@ -121,7 +120,7 @@ def taken_in(
     classes_XYZ: Array,
     key: Array,
 ) -> FrameCache:
-    """Encode the present voxels and add them to the cache; what is not known of them is noise."""
+    """Encode the present voxels and add them to the cache; unknown ones are noise."""
     config, noise = model.backbone.world_frames, model.voxel_noise
     vae, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)
     known = grid_state.known_latents(model, classes_XYZ)
@@ -166,11 +165,11 @@ NEAREST_M = 0.05
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class ObservedCells:
-    """What is seen of the cells of a window.
+    """What an image shows of the cells of a window.
 
     Attributes:
-        air_XYZ: bool, that nothing is there.
-        colour_XYZ: int32 number of the palette's colour of the surface in it, −1 where none is.
+        air_XYZ: bool, whether the cell is empty.
+        colour_XYZ: int32 number of the palette's colour of the surface in it, −1 without one.
     """
 
     air_XYZ: Array
@@ -178,7 +177,7 @@ class ObservedCells:
 
 
 def advantage(model: PersistModel, evidence: ObservedCells, classes: int) -> Array:
-    """Return the nats (X, Y, Z, classes) that sight adds to the scores of classes."""
+    """Return the nats (X, Y, Z, classes) that evidence adds to the scores of classes."""
     number = jnp.arange(classes)
     colours = model.memory.colours
     air = evidence.air_XYZ[..., None] & (number == 0)
@@ -189,14 +188,10 @@ def advantage(model: PersistModel, evidence: ObservedCells, classes: int) -> Arr
 def seen(
     model: PersistModel, corner_3: Array, rgb_HWC: Array, depth_HW: Array, camera: Camera
 ) -> ObservedCells:
-    """Return what a picture shows of a window's cells.
+    """Return what an image shows of a window's cells.
 
-    Args:
-        model: the model.
-        corner_3: the window's lowest corner, metres.
-        rgb_HWC: colours in [−1, 1].
-        depth_HW: depth, metres; 0 where nothing was measured.
-        camera: its camera.
+    ``corner_3`` is the window's lowest corner, metres; colours are in [−1, 1]; depth is in metres,
+    0 without measurement.
     """
     size, side = grid_state.cell_m(model), grid_state.side(model)
     eye = camera.world_from_camera[:3, 3]
@@ -224,7 +219,7 @@ def seen(
 
 
 def _before(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
-    """Return which cells (X, Y, Z) lie before what was measured in their direction."""
+    """Return the cells (X, Y, Z) in front of the measured depth in their direction."""
     size, side = grid_state.cell_m(model), grid_state.side(model)
     steps = (np.arange(side) + 0.5) * size
     middle = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).astype(np.float32)

@@ -1,12 +1,11 @@
-"""The world of PERSIST: a grid of class ids that evolves, and pictures made of it.
+"""The world of PERSIST: a grid of class ids that evolves, and images rendered from it.
 
-What is remembered is the state of the world itself. A diffusion transformer makes the next voxels,
-a camera model says where the agent goes, rays through the voxels say what it faces, and a second
-diffusion transformer makes the picture of that (arXiv 2603.03482). Decoded voxels are encoded anew
-at each step, so what is edited in the grid (``memory.class_grid``, ``Memory.erase`` and ``move``,
-``edit`` here) is the world that goes on.
+The memory is the state of the world itself. A diffusion transformer samples the next voxels, a
+camera model predicts the camera, rays through the voxels determine what it faces, and a second
+diffusion transformer renders the image (arXiv 2603.03482). Voxels are encoded at each step, so
+edits of the grid (``edit``, ``PERSIST.erase``, ``PERSIST.move``) change the frames that follow.
 
-Where actions steer, the camera model says where they lead; cameras that are given are kept.
+Where actions steer, the camera model predicts the cameras; given cameras are kept.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import jax.numpy as jnp
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import UserError, register
 from pewm_jax.geometry import actions as action_geometry
-from pewm_jax.memory import class_grid
 from pewm_jax.memory import interface as memories
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
@@ -41,7 +39,7 @@ START = 0
 
 @register("world", "persist")
 @dataclasses.dataclass(frozen=True)
-class PERSIST(PersistModel):
+class PERSIST(memories.MemoryEdits, PersistModel):
     """A world that is three-dimensional itself (PERSIST, arXiv 2603.03482)."""
 
     def init(self, key: Array) -> Params:
@@ -69,8 +67,8 @@ class PERSIST(PersistModel):
     def start(self, params: Params, frames: Frames) -> WorldState:
         """Begin a world; see ``worlds.start``.
 
-        The voxels around the first frame are generated from its picture. Each later frame advances
-        them by one step with the real picture.
+        The voxels around the first frame are generated from its image. Each later frame advances
+        them by one step with the real image.
         """
         checks.require_frames(self, frames, "start")
         return _from_nothing(self, params, frames)
@@ -93,8 +91,8 @@ class PERSIST(PersistModel):
     ) -> tuple[WorldState, Frames]:
         """Imagine frame after frame; see ``worlds.imagine``.
 
-        Without ``memory`` the voxels are generated anew from the present picture, and the state
-        keeps its grid.
+        Without ``memory`` the voxels are generated from the present image, and the state keeps its
+        grid.
         """
         params = _arrays(params)[0]
         asked, steered = _asked(self, state.frame.camera, control)
@@ -112,25 +110,6 @@ class PERSIST(PersistModel):
         last = jax.tree.map(lambda x: x[-1:], frames)
         return WorldState(last, after.grid if remember and memory else state.map), frames
 
-    def erase(self, params: Params, state: WorldState, box_23: Array) -> WorldState:
-        """Erase a box from the grid and the present frame; see ``World.erase``."""
-        del params
-        return memories.edited(self, state, self.memory.erase(self, state.map, box_23))
-
-    def move(
-        self,
-        params: Params,
-        state: WorldState,
-        box_23: Array,
-        transform: Array,
-        *,
-        leave: bool = False,
-    ) -> WorldState:
-        """Move the content of a box in the grid and the present frame; see ``World.move``."""
-        del params
-        changed = self.memory.move(self, state.map, box_23, transform, leave=leave)
-        return memories.edited(self, state, changed)
-
 
 def start_in(
     model: PersistModel,
@@ -141,19 +120,19 @@ def start_in(
     *,
     depth_scale: float | None = None,
 ) -> WorldState:
-    """Begin a world from a known grid; what of the first window is not in it is generated.
+    """Begin a world from a known grid; unknown cells of the first window are generated.
 
     Args:
         model: the model.
         params: all parameters.
         frames: S ≥ 1 frames in it, as for ``worlds.start``.
-        classes_XYZ: (n, n, n) class ids around the first frame's camera, such as an episode has;
-            −1 where nothing is known.
+        classes_XYZ: (n, n, n) class ids around the first frame's camera, as episodes have them;
+            −1 where unknown.
         origin_3: (3,) world position of its lowest corner, metres.
         depth_scale: as for ``worlds.start``.
 
     Raises:
-        UserError: as for ``worlds.start``, or no grid around the camera.
+        UserError: as for ``worlds.start``, or the shape of the grid is another.
     """
     frames = checks.check_frames(frames, "start_in", depth_scale)
     return _start_in(model, params, frames, classes_XYZ, origin_3, depth_scale)
@@ -182,12 +161,14 @@ def _start_in(
     off = jnp.round((empty.low_3 - origin) / size)
     low = origin + off * size
     given = jnp.asarray(classes_XYZ).astype(jnp.int16)
-    cells = _pasted(empty.classes_XYZ, given, -off.astype(jnp.int32))
+    shape = empty.classes_XYZ.shape
+    given = grid_state.cut(given, off.astype(jnp.int32), shape)  # unknown where it does not reach
+    cells = jnp.where(given >= 0, given, empty.classes_XYZ)
     return _started(model, params, ClassGrid(cells, low), frames)
 
 
 def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -> WorldState:
-    """Change the voxels of a world; the next frames are imagined of the changed ones.
+    """Change the voxels of a world; the next frames show the change.
 
     ::
 
@@ -199,8 +180,8 @@ def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -
 
     Args:
         state: the world.
-        change: one of the functions of ``memory.class_grid``.
-        arguments: the grid's settings, and what follows the grid among the function's arguments.
+        change: a function of ``memory.class_grid``.
+        arguments: the grid's settings, and the function's arguments after the grid.
     """
     config, *rest = arguments
     changed = change(config, state.map, *rest)
@@ -217,12 +198,12 @@ def render_true(
     origin_T3: Array,
     key: Array,
 ) -> tuple[WorldState, Frames]:
-    """Imagine the pictures of voxels that are given: the bound of what the renderer can do.
+    """Render given voxels: the upper bound of the renderer's quality.
 
     Args:
         model: the model.
         params: all parameters.
-        state: from ``start_in``, whose cells lie as the recorded ones.
+        state: from ``start_in``, with the same lattice of cells as the recorded grids.
         control: cameras of the n frames, or a ``Control`` with actions.
         classes_TXYZ: (n, R, R, R) recorded grids around them.
         origin_T3: (n, 3) their lowest corners, metres.
@@ -249,7 +230,7 @@ def render_true(
 
 
 def past_of(model: PersistModel, params: Params, state: WorldState) -> Past:
-    """Return what a step needs of a state."""
+    """Return the input of a step from a state."""
     frame = state.frame
     latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
     camera = jax.tree.map(lambda x: x[0], frame.camera)
@@ -257,14 +238,14 @@ def past_of(model: PersistModel, params: Params, state: WorldState) -> Past:
 
 
 def _arrays(*trees: Any) -> Any:
-    """Return trees of JAX arrays: weights as they are loaded are NumPy's, which are no tables."""
+    """Return trees of JAX arrays: loaded weights are NumPy's, which traced indices cannot index."""
     return jax.tree.map(jnp.asarray, trees)
 
 
 def _from_nothing(
     model: PersistModel, params: Params, frames: Frames, *, real: bool = True
 ) -> WorldState:
-    """Return a world of which nothing but frames is known."""
+    """Return a world of which only frames are known."""
     params, frames = _arrays(params, as_signal(frames))
     grid = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
     return _started(model, params, grid, frames, real=real)
@@ -282,7 +263,7 @@ def _started(
 
 
 def _observed(model: PersistModel, params: Params, past: Past, frames: Frames) -> WorldState:
-    """Carry the voxels on along real frames."""
+    """Advance the voxels along real frames."""
     count = frames.depth_THW.shape[0]
     here = past.shown.camera.world_from_camera[None]
     poses = jnp.concatenate([here, frames.camera.world_from_camera])
@@ -299,14 +280,14 @@ def _observed(model: PersistModel, params: Params, past: Past, frames: Frames) -
 
 
 def _between(model: PersistModel, poses: Array) -> Array:
-    """Return the actions between cameras; where they are not planar nobody knows them: zeros."""
+    """Return the actions between cameras; zeros where they are not planar and so unknown."""
     if model.control.actions == action_geometry.PLANAR:
         return action_geometry.actions_between(poses)
     return jnp.zeros((len(poses) - 1, model.control.actions))
 
 
 def _asked(model: PersistModel, present: Camera, control: Any) -> tuple[Control, bool]:
-    """Return cameras and actions of the frames to imagine, and whether actions alone steer."""
+    """Return cameras and actions of the frames to imagine, and whether only actions steer."""
     planar = model.control.actions == action_geometry.PLANAR
     if isinstance(control, Camera) and planar:
         control = Control(control)
@@ -319,15 +300,3 @@ def _asked(model: PersistModel, present: Camera, control: Any) -> tuple[Control,
     steered = not isinstance(control, (Camera, Control))
     asked = control_of(model, present, control)
     return asked, steered
-
-
-def _pasted(cells_XYZ: Array, given_XYZ: Array, at_3: Array) -> Array:
-    """Put known cells into a grid at a place, which may reach out of it."""
-    for axis in range(3):
-        index = jnp.arange(cells_XYZ.shape[axis]) - at_3[axis]
-        size = given_XYZ.shape[axis]
-        found = jnp.take(given_XYZ, jnp.clip(index, 0, size - 1), axis=axis)
-        inside = (index >= 0) & (index < size)
-        inside = inside.reshape([-1 if a == axis else 1 for a in range(3)])
-        given_XYZ = jnp.where(inside, found, class_grid.UNKNOWN)
-    return jnp.where(given_XYZ >= 0, given_XYZ, cells_XYZ)

@@ -1,21 +1,22 @@
-"""Many candidates from one state: what they share is computed once, and only what is asked for.
+"""Many candidates from one state: shared parts are computed once, and only requested frames.
 
-A candidate imagines what ``imagine`` imagines without remembering. The present frame is encoded
-once. The rendered memory may be given (``Views``); otherwise it is rendered, on a CPU, once per
-distinct camera (equal beginnings lead to equal cameras), and not in both sides of a branch as under
-``jax.vmap``. If only the last frame is asked for, only that is decoded, where the codec works frame
+A candidate imagines the same as ``imagine`` without remembering. The present frame is encoded once.
+The rendered memory may be given (``Views``); otherwise it is rendered, on a CPU, once per distinct
+camera (equal beginnings lead to equal cameras), and not in both sides of a branch as under
+``jax.vmap``. If only the last frame is requested, only that is decoded, where the codec works frame
 by frame.
 
-``Views`` keeps what it renders. Discrete actions lead to the same places by many ways, and the
-candidates of a search resemble each other the more the longer it lasts. Cameras count as equal up
-to a millionth of a metre, because the same turns in another order differ in their last bits. The
-views are those of the rounded cameras, whatever was asked for before.
+``Views`` caches renderings. Discrete actions reach the same places by many ways, and the candidates
+of a search become more alike the longer it lasts. Cameras count as equal up to a millionth of a
+metre, because the same turns in another order differ in their last bits. Views are those of the
+rounded cameras, independent of earlier requests.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -66,7 +67,7 @@ def imagine_clip(
     memory: bool,
     view: View | None = None,
 ) -> Frames:
-    """Imagine one clip of every candidate.
+    """Imagine one clip of every candidate: (K, n) frames.
 
     Args:
         model: the model.
@@ -77,10 +78,7 @@ def imagine_clip(
         keys: (K,) sampling noise.
         shown: which of the T − 1 frames are returned.
         memory: False ignores the memory.
-        view: (K, T) what the memory looks like, if it is known.
-
-    Returns:
-        (K, n) frames.
+        view: (K, T) the rendered memory, if it is known.
     """
     frame, shared = present
     count = len(keys)
@@ -95,26 +93,17 @@ def imagine_clip(
 
     whole = dataclasses.replace(control, camera=camera)
     conditioning = jax.vmap(condition, (None if shared else 0, 0))(frame, whole)
-    readout = None
-    if memory and "memory" in params:
-        readout = look(model, remembered, camera, params, view)
-        batched = jax.tree.map(lambda x: x[:, None], readout)
-        latents = jax.vmap(functools.partial(world_model.draw, model, params))(
-            conditioning, batched, keys
-        )
-    else:
-        latents = jax.vmap(lambda given, key: world_model.draw(model, params, given, None, key))(
-            conditioning, keys
-        )
-    latents = latents[:, 0]
+    reads = memory and "memory" in params
+    readout = look(model, remembered, camera, params, view) if reads else None
+    batched = jax.tree.map(lambda x: x[:, None], readout)
+    draw = functools.partial(world_model.draw, model, params)
+    latents = jax.vmap(draw)(conditioning, batched, keys)[:, 0]
     seen = slice(shown.start + 1, shown.stop + 1)  # frame 0 of a clip is the present one
-    early = model.codec.framewise
-    if early:
-        latents, seen_there = latents[:, seen], slice(None)
-    else:
-        seen_there = seen
+    decoded = seen
+    if model.codec.framewise:  # only the frames that are returned are decoded
+        latents, decoded = latents[:, seen], slice(None)
     rgb, depth = rgbd.decode_rgbd(model, params, latents)
-    rgb, depth = rgb[:, seen_there], depth[:, seen_there]
+    rgb, depth = rgb[:, decoded], depth[:, decoded]
     if readout is not None and readout.view is not None and memories.gated(model):
         remembered_there = jax.tree.map(lambda x: x[:, seen], readout.view)
         rgb, depth = rgbd.mix(model, params, rgb, depth, remembered_there)
@@ -125,15 +114,7 @@ def imagine_clip(
 def look(
     model: AssembledModel, remembered: Any, camera: Camera, params: Params, view: View | None = None
 ) -> MemoryReadout:
-    """Return what a memory shows K clips, leading axis K; see ``memory.interface.readout``.
-
-    Args:
-        model: the model.
-        remembered: the memory.
-        camera: (K, T) cameras.
-        params: the world model's parameters.
-        view: (K, T) what it looks like, if that is known.
-    """
+    """Return the readout of K clips, leading axis K; ``view`` (K, T) is the rendering, if known."""
     pictures = memories.gated(model)
     reader = model.memory.reader
     each = functools.partial(memories.readout, model, remembered, params=params, pictures=pictures)
@@ -153,14 +134,9 @@ def look(
 
 
 def each_camera_once(render: Any, camera: Camera) -> View:
-    """Render (K, T) cameras one after the other, and those that are equal only once.
+    """Render (K, T) cameras one after the other, equal ones only once.
 
-    Args:
-        render: (T,) cameras → (T,) pictures.
-        camera: (K, T) cameras; equal means the same numbers.
-
-    Returns:
-        (K, T) pictures.
+    ``render`` maps (T,) cameras to (T,) views; cameras are equal if all their numbers are.
     """
     leading = camera.world_from_camera.shape[:2]
     flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), camera)
@@ -171,15 +147,21 @@ def each_camera_once(render: Any, camera: Camera) -> View:
     new = first == jnp.arange(count)
     slot = (jnp.cumsum(new) - 1)[first]
     (order,) = jnp.nonzero(new, size=count, fill_value=0)
-    like = jax.eval_shape(render, jax.tree.map(lambda x: x[:1], flat))
-    blank = jax.tree.map(lambda x: jnp.zeros((count, *x.shape[1:]), x.dtype), like)
+    pictures = _one_by_one(render, flat, new.sum(), lambda number: order[number])
+    return jax.tree.map(lambda x: x[slot].reshape(*leading, *x.shape[1:]), pictures)
+
+
+def _one_by_one(render: Any, camera: Camera, count: Array, pick: Callable[[Array], Any]) -> View:
+    """Render ``count`` of (n,) cameras, chosen by their order, one by one; other views are 0."""
+    like = jax.eval_shape(render, jax.tree.map(lambda x: x[:1], camera))
+    room = len(camera.intrinsics_4)
+    blank = jax.tree.map(lambda x: jnp.zeros((room, *x.shape[1:]), x.dtype), like)
 
     def draw(number: Array, pictures: View) -> View:
-        one = render(jax.tree.map(lambda x: x[order[number]][None], flat))
+        one = render(jax.tree.map(lambda x: x[pick(number)][None], camera))
         return jax.tree.map(lambda all_, x: all_.at[number].set(x[0]), pictures, one)
 
-    pictures = jax.lax.fori_loop(0, new.sum(), draw, blank)
-    return jax.tree.map(lambda x: x[slot].reshape(*leading, *x.shape[1:]), pictures)
+    return jax.lax.fori_loop(0, count, draw, blank)
 
 
 FINE = 2.0**-20
@@ -191,12 +173,7 @@ MOST = 512 * 2**20
 
 
 class Views:
-    """The views of one memory; a callable that remembers. On the host, not under jit.
-
-    Args:
-        model: the model.
-        state: the world whose memory is looked at.
-    """
+    """The views of one state's memory; a callable with a cache. On the host, not under jit."""
 
     def __init__(self, model: AssembledModel, state: WorldState):
         self.model, self.state = model, state
@@ -244,20 +221,11 @@ def _rounded(x: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _rendered(model: AssembledModel, memory: Any, camera: Camera, count: Array) -> View:
-    """Render the first ``count`` of (n,) cameras one after the other; the other views are 0."""
-
-    def render(number: Array) -> View:
-        one = jax.tree.map(lambda x: x[number][None], camera)
-        return memories.render(model, memory, one, model.clip.height, model.clip.width)
-
-    def add(number: Array, pictures: View) -> View:
-        return jax.tree.map(lambda all_, x: all_.at[number].set(x[0]), pictures, render(number))
-
-    like = jax.eval_shape(render, 0)
-    room = jax.tree.map(
-        lambda x: jnp.zeros((len(camera.intrinsics_4), *x.shape[1:]), x.dtype), like
+    """Render the first ``count`` of (n,) cameras; the other views are 0."""
+    height, width = model.clip.height, model.clip.width
+    return _one_by_one(
+        lambda one: memories.render(model, memory, one, height, width), camera, count, lambda n: n
     )
-    return jax.lax.fori_loop(0, count, add, room)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -8,8 +8,6 @@ between the two at each pixel.
 
 from __future__ import annotations
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 
@@ -17,19 +15,13 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_depth
 from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError
 from pewm_jax.memory import interface as memories
-from pewm_jax.models.lpips import convert as lpips_weights
-from pewm_jax.models.lpips import model as lpips
-from pewm_jax.types import Array, Clip, Control, Frames, Params
+from pewm_jax.types import Array, Clip, Control, Params
 from pewm_jax.worlds import codec as codec_task
 from pewm_jax.worlds import objective, world_model
 
 
 def require_gate(model: AssembledModel) -> None:
-    """Refuse a model in which there is nothing to learn.
-
-    Raises:
-        UserError: its codec has no gate, or its memory shows no colours.
-    """
+    """Refuse a model whose codec has no gate, or whose memory shows no colours."""
     if not memories.gated(model):
         raise UserError(
             "train.gate.steps is above 0, but this model has no gate that mixes its memory's "
@@ -44,7 +36,7 @@ def prepare(model: AssembledModel, params: Params, clip: Clip) -> Clip:
     The noise depends on the clips alone.
 
     Raises:
-        UserError: the model's codec has no gate, or its memory shows no colours.
+        UserError: see ``require_gate``.
     """
     require_gate(model)
     readout = objective.clip_readout(model, params, clip, pictures=True)
@@ -58,12 +50,9 @@ def prepare(model: AssembledModel, params: Params, clip: Clip) -> Clip:
     latents = world_model.sample(
         model, params, conditioning, readout, noise, jax.random.fold_in(key, 1)
     )
-    emptied = dataclasses.replace(
-        clip,
-        context=jax.tree.map(lambda x: x[:, :0], clip.context),
-        context_valid_S=clip.context_valid_S[:, :0],
+    return clip.without_context().with_extras(
+        context_features_ShwF=None, latents_thwC=latents, readout=readout
     )
-    return emptied.with_extras(context_features_ShwF=None, latents_thwC=latents, readout=readout)
 
 
 def loss(
@@ -79,12 +68,7 @@ def loss(
     rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
     far = signal_from_depth(model.clip, view.depth_THW)[..., None]
     shown = jnp.concatenate([view.features_THWF[..., :3], far], -1)
-    frames = as_signal(clip.frames)
-    truth = Frames(
-        frames.rgb_THWC[:, 1:],
-        frames.depth_THW[:, 1:],
-        jax.tree.map(lambda x: x[:, 1:], frames.camera),
-    )
+    truth = jax.tree.map(lambda x: x[:, 1:], as_signal(clip.frames))
     return codec_task.score(
         model,
         params["codec"]["gate"],
@@ -98,15 +82,8 @@ def loss(
 
 
 def perceptual(model: AssembledModel, train: TrainSettings) -> Params | None:
-    """Return the weights of LPIPS that ``loss`` needs, under ``lpips``, or None.
-
-    Raises:
-        UserError: they are asked for and not installed, or damaged, or frames are too small.
-    """
+    """Return the weights that ``loss`` needs, or None; see ``codec_task.lpips_weights``."""
     assert isinstance(train, TrainConfig)
     if not train.gate_lpips:
         return None
-    file = lpips_weights.find(codec_task.LPIPS)
-    found = {"lpips": lpips_weights.read(file, codec_task.LPIPS)[1]}
-    lpips.require_size(codec_task.LPIPS, model.clip.height, model.clip.width)
-    return found
+    return codec_task.lpips_weights(codec_task.LPIPS, model.clip)

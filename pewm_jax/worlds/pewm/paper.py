@@ -8,11 +8,10 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal
 
-from pewm_jax.config.clip import ClipConfig
 from pewm_jax.config.experiment import Config
-from pewm_jax.config.mesh import MeshConfig
 from pewm_jax.config.parts import Codec, Encoder, Noise
-from pewm_jax.config.training import DataConfig, EvalConfig, StageConfig, TrainConfig
+from pewm_jax.config.training import DataConfig, EvalConfig, MeshConfig, StageConfig, TrainConfig
+from pewm_jax.config.world import ClipConfig
 from pewm_jax.encoders.patch_colours import PatchColoursConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
@@ -41,14 +40,13 @@ def experiment(
 ) -> Config:
     """Return the settings with which a video model becomes the paper's world model.
 
-    As the paper trains: stage 1 fine-tunes the backbone to colour with depth and to cameras, stage
-    2 trains the memory blocks alone; Adam, learning rate 1e-4 after a linear warm-up, gradients
-    clipped at norm 1, bfloat16. The map has 256 × 256 × 32 cells of 0.25 × 0.25 × 1 m, read through
-    positions relative to the clip's first camera. What the paper does not say is chosen: 512 cells
-    per clip, 16 frames of context, the size of a memory block (see ``READER``), 256 clips per step;
-    weights split over 8 devices, a node of GPUs, and copied beyond. The paper does not state Adam's
-    decays; they are those of CogVideoX's own fine-tuning (0.9 and 0.95, ε 1e-8; CogVideo's
-    ``sat/configs/sft.yaml``).
+    As in the paper, stage 1 fine-tunes the backbone to RGB-D and cameras, stage 2 trains the memory
+    blocks alone; Adam, learning rate 1e-4 after a linear warm-up, gradients clipped at norm 1,
+    bfloat16. The map has 256 × 256 × 32 cells of 0.25 × 0.25 × 1 m, read through positions relative
+    to the clip's first camera. Not in the paper, and chosen here: 512 cells per clip, 16 frames of
+    context, the size of a memory block (see ``READER``), 256 clips per step; weights split over 8
+    devices, a node of GPUs, and copied beyond. Adam's decays are those of CogVideoX's own
+    fine-tuning (0.9 and 0.95, ε 1e-8; CogVideo's ``sat/configs/sft.yaml``).
 
     Args:
         backbone: the video model's transformer.
@@ -58,9 +56,6 @@ def experiment(
         clip: the shape of a clip.
         encoder: the image features that the map keeps, by default the colours of patches.
         dtype: compute precision.
-
-    Raises:
-        ConfigError: the parts do not fit together.
     """
     return Config(
         model=PEWM(

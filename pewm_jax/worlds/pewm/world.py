@@ -1,8 +1,7 @@
 """The world of PEWM: a video diffusion model, clip after clip, with a memory.
 
-Each clip is conditioned on the present frame, on the control, and on the part of the memory that
-its cameras see. Imagined frames are inserted in the same way as observed ones, with
-``observed=False``.
+Each clip is conditioned on the present frame, the control, and the memory's readout for its
+cameras. Imagined frames are inserted as observed ones are, with ``observed=False``.
 """
 
 from __future__ import annotations
@@ -26,63 +25,56 @@ from pewm_jax.worlds.pewm import candidates
 from pewm_jax.worlds.pewm import gate as pewm_gate
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
-STAGES = (
-    Stage(
-        name="stage1",
-        number=1,
-        rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|encoder|image|text)/.*", FREEZE)),
-        init=functools.partial(world_model.init, memory=False),
-        loss=objective.without_memory,
-        prepare=functools.partial(objective.prepare, memory=False),
-    ),
-    Stage(
-        name="stage2",
-        number=2,
-        rules=((r"memory/.*", TRAIN), (r"(backbone|control|codec|encoder|image|text)/.*", FREEZE)),
-        init=world_model.init,
-        loss=objective.with_memory,
-        memory=True,
-        prepare=functools.partial(objective.prepare, memory=True),
-    ),
-    Stage(
-        name="joint",
-        number=3,
-        rules=(
-            (r"(backbone|control|memory)/.*", TRAIN),
-            (r"(codec|encoder|image|text)/.*", FREEZE),
-        ),
-        init=world_model.init,
-        loss=objective.with_memory,
-        memory=True,
-        prepare=functools.partial(objective.prepare, memory=True),
-        optional=True,
-    ),
-    Stage(
-        name="gate",
-        number=4,
-        rules=(
-            (r"codec/gate/.*", TRAIN),
-            (r"(backbone|control|memory|codec|encoder|image|text)/.*", FREEZE),
-        ),
-        init=world_model.init,
-        loss=pewm_gate.loss,
-        memory=True,
-        prepare=pewm_gate.prepare,
-        prepares_by=("backbone", "control", "memory", "codec", "encoder", "image", "text"),
-        optional=True,
-        extra_weights=pewm_gate.perceptual,
-        require=pewm_gate.require_gate,
-    ),
+FROZEN = r"(codec|encoder|image|text)/.*"
+STAGE_1 = Stage(
+    name="stage1",
+    number=1,
+    rules=((r"(backbone|control)/.*", TRAIN), (FROZEN, FREEZE)),
+    init=functools.partial(world_model.init, memory=False),
+    loss=objective.without_memory,
+    prepare=functools.partial(objective.prepare, memory=False),
 )
+STAGE_2 = Stage(
+    name="stage2",
+    number=2,
+    rules=((r"memory/.*", TRAIN), (r"(backbone|control|codec|encoder|image|text)/.*", FREEZE)),
+    init=world_model.init,
+    loss=objective.with_memory,
+    memory=True,
+    prepare=functools.partial(objective.prepare, memory=True),
+)
+JOINT = dataclasses.replace(
+    STAGE_2,
+    name="joint",
+    number=3,
+    rules=((r"(backbone|control|memory)/.*", TRAIN), (FROZEN, FREEZE)),
+    optional=True,
+)
+GATE = Stage(
+    name="gate",
+    number=4,
+    rules=(
+        (r"codec/gate/.*", TRAIN),
+        (r"(backbone|control|memory|codec|encoder|image|text)/.*", FREEZE),
+    ),
+    init=world_model.init,
+    loss=pewm_gate.loss,
+    memory=True,
+    prepare=pewm_gate.prepare,
+    prepares_by=("backbone", "control", "memory", "codec", "encoder", "image", "text"),
+    optional=True,
+    extra_weights=pewm_gate.perceptual,
+    require=pewm_gate.require_gate,
+)
+STAGES = (STAGE_1, STAGE_2, JOINT, GATE)
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
-the memory reader, which has no effect at first, and trains only that. Stages ``joint``
-and ``gate``, which are ours and are left out unless they have steps, then train both, and the
-codec's gate on what the model imagines."""
+the memory reader, which has no effect at first, and trains only the reader. ``joint`` trains both,
+and ``gate`` the codec's gate on imagined clips; these two are ours, and skipped without steps."""
 
 
 @register("world", "pewm")
 @dataclasses.dataclass(frozen=True)
-class PEWM(AssembledModel):
+class PEWM(memories.MemoryEdits, AssembledModel):
     """A video diffusion model with a memory (PEWM)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = TrainConfig
@@ -92,10 +84,7 @@ class PEWM(AssembledModel):
         return world_model.init(self, key)
 
     def stages(self) -> tuple[Stage, ...]:
-        """Return the paper's two stages, and two optional ones.
-
-        If the control has another learning rate, its parameters get that.
-        """
+        """Return the paper's two stages and two optional ones, with the control's learning rate."""
         if self.control.rate == 1:
             return STAGES
         rates = ((r"control/.*", self.control.rate),)
@@ -154,15 +143,10 @@ class PEWM(AssembledModel):
     ) -> tuple[WorldState, Frames]:
         """Imagine one clip: the T − 1 frames after the present one.
 
-        Args:
-            params: the world model's parameters.
-            state: the world so far.
-            control: (T − 1) cameras of the frames to imagine, and actions that lead to them.
-            key: sampling noise.
-            remember: see ``worlds.imagine``.
-            memory: False ignores the memory.
-            valid_T: (T − 1,) bool, True for the leading frames that were asked for; None if all
-                were.
+        Args: params: the world model's parameters. state: the world so far. control: (T − 1)
+            cameras of the frames to imagine, and actions that lead to them. key: sampling noise.
+            remember: see ``worlds.imagine``. memory: False ignores the memory. valid_T: (T − 1,)
+            bool, True for the leading frames that were asked for; None if all were.
 
         Returns:
             The next state and T − 1 frames, colours float in [−1, 1]. If the denoiser works without
@@ -225,10 +209,10 @@ class PEWM(AssembledModel):
         last: bool = False,
         views: View | None = None,
     ) -> tuple[WorldState, Frames]:
-        """Imagine K candidates; see ``worlds.imagine_many``. ``views`` is of ``candidates.Views``.
+        """Imagine K candidates; ``views`` is the result of ``candidates.Views``.
 
-        The computation is that of ``imagine`` without ``remember``, but what the candidates share
-        is computed once; see ``worlds.pewm.candidates``.
+        The computation is that of ``imagine`` without ``remember``, but shared parts are computed
+        once; see ``worlds.pewm.candidates``.
         """
         asked = jax.vmap(lambda control: control_of(self, state.frame.camera, control))(controls)
         length = self.clip.frames - 1
@@ -263,25 +247,6 @@ class PEWM(AssembledModel):
         """Return what renders the memory for candidates; None if the model reads no rendering."""
         pictures = memories.gated(self) or self.memory.reader.READS_VIEW
         return candidates.Views(self, state) if pictures and "memory" in params else None
-
-    def erase(self, params: Params, state: WorldState, box_23: Array) -> WorldState:
-        """Erase a box from the memory and the present frame; see ``World.erase``."""
-        del params
-        return memories.edited(self, state, self.memory.erase(self, state.map, box_23))
-
-    def move(
-        self,
-        params: Params,
-        state: WorldState,
-        box_23: Array,
-        transform: Array,
-        *,
-        leave: bool = False,
-    ) -> WorldState:
-        """Move the content of a box in the memory and the present frame; see ``World.move``."""
-        del params
-        changed = self.memory.move(self, state.map, box_23, transform, leave=leave)
-        return memories.edited(self, state, changed)
 
     def coverage(
         self, params: Params, state: WorldState, frames: Frames, seen_THW: Array
