@@ -78,7 +78,7 @@ def parts(model, params, state, actions_KN, key) -> dict[str, Clock]:
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b], 1), first, asked.camera)
 
     def look(params, memory, actions):
-        return pewm_many.look(model, memory, cameras(actions), params)
+        return pewm_many.read_memory(model, memory, cameras(actions), params)
 
     def condition(params, frame, actions):
         def one(camera):

@@ -180,26 +180,21 @@ def _missing(settings: type) -> list[str]:
     return [name for name, value in every if getattr(value, "__isabstractmethod__", False)]
 
 
-_FUNCTIONS: dict[str, dict[str, str]] = {
-    "noise": {
-        "shown": "precondition",
-        "target": "prediction_target",
-        **{name: name for name in ("draw", "corrupt", "weight", "to_x0", "levels", "sample")},
-    },
-    "codec": {name: name for name in ("init", "encode", "decode", "measured")},
-    "encoder": {name: name for name in ("init", "encode", "preprocessing")},
-    "backbone": {name: name for name in ("init", "apply", "init_image", "observed")},
-    "control": {name: name for name in ("init", "condition")},
-    "world": {
-        name: name
-        for name in (
-            *("init", "stages", "sharding", "split_heads", "start", "observe", "imagine"),
-            *("imagine_many", "to_compare", "views", "memory_points", "point_colours"),
-            *("erase", "move", "coverage"),
-        )
-    },
+_FUNCTIONS: dict[str, tuple[str, ...]] = {
+    "noise": ("shown", "target", "draw", "corrupt", "weight", "to_x0", "levels", "sample"),
+    "codec": ("init", "encode", "decode", "measured"),
+    "encoder": ("init", "encode", "preprocessing"),
+    "backbone": ("init", "apply", "init_image", "observed"),
+    "control": ("init", "condition"),
+    "world": (
+        *("init", "stages", "sharding", "split_heads", "start", "observe", "imagine"),
+        *("imagine_many", "to_compare", "views", "memory_points", "point_colours"),
+        *("erase", "move", "coverage"),
+    ),
 }
-"""Section → function of a module in version 0.1 → the method that it is now."""
+"""Section → functions of a module in version 0.1 that are methods now."""
+_RENAMED = {"shown": "precondition", "target": "prediction_target"}
+"""Function → its method, if the name is another."""
 _OF_THE_MODEL = {("backbone", "observed"), ("control", "init"), ("control", "condition")}
 """Functions whose first argument was the model and not the settings."""
 
@@ -217,7 +212,8 @@ def _add_methods(section: str, name: str, settings: type, where: Any) -> None:
         module = imported(where, f"{section} of kind {name!r}") if isinstance(where, str) else where
         return getattr(module, function, None)
 
-    for function, method in _FUNCTIONS.get(section, {}).items():
+    for function in _FUNCTIONS.get(section, ()):
+        method = _RENAMED.get(function, function)
         of_model = (section, function) in _OF_THE_MODEL
         inherited = getattr(settings, method)
         setattr(settings, method, _method(find, function, inherited, of_model=of_model))

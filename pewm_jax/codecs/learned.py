@@ -43,10 +43,8 @@ class LearnedCodecConfig(Codec):
     """8 × 8 pixels of one frame to a few channels; trained by the world `codec`.
 
     Depth is encoded as a grey image by the same weights. A model with this codec starts from
-    trained
-    weights: `--train.start runs/codec --train.fresh 'memory/.*' 'backbone/.*' 'control/.*'` takes
-        the
-    codec of that run and initializes all other parameters at random.
+    trained weights: `--train.start runs/codec --train.fresh 'memory/.*' 'backbone/.*' 'control/.*'`
+    takes the codec of that run and initializes all other parameters at random.
     """
 
     SHARDING: ClassVar[Rules] = (
@@ -58,6 +56,8 @@ class LearnedCodecConfig(Codec):
     DEPTH_AS_GREY: ClassVar[bool] = True
     CONVERTED: ClassVar[bool] = True
     WEIGHTS_FROM: ClassVar[str] = "train it (pewm-jax train codec)"
+    spatial: ClassVar[int] = 8
+    temporal: ClassVar[int] = 1
 
     latent_channels: int = 16
     """Latent channels of colour, and as many of depth."""
@@ -73,16 +73,6 @@ class LearnedCodecConfig(Codec):
     gate: int = 0
     """Channels of the gate, which mixes decoded frames with the rendered memory (48, say); 0 for no
     gate."""
-
-    @property
-    def spatial(self) -> int:
-        """Pixels per latent cell, each way."""
-        return 8
-
-    @property
-    def temporal(self) -> int:
-        """Frames per latent frame after the first: every frame is encoded by itself."""
-        return 1
 
     @property
     def rgb_channels(self) -> int:

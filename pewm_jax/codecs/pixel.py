@@ -63,13 +63,7 @@ class PixelConfig(Codec):
 def fold(video_BTHWC: Array, spatial: int, temporal: int) -> Array:
     """Move s × s pixels of q frames into the channels of one latent cell.
 
-    Args:
-        video_BTHWC: (B, q·k + 1, H, W, C) float.
-        spatial: s.
-        temporal: q.
-
-    Returns:
-        (B, k + 1, H/s, W/s, q·s·s·C) latents.
+    (B, q·k + 1, H, W, C) becomes (B, k + 1, H/s, W/s, q·s·s·C).
 
     Raises:
         ValueError: the frame count is not q·k + 1, or s does not divide the image.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 
 from pewm_jax.codecs.pixel import fold
-from pewm_jax.codecs.signals import depth_from_signal, signal_from_depth
+from pewm_jax.codecs.signals import depth_from_signal, rgbd_signal, signal_from_depth
 from pewm_jax.config import AssembledModel
 from pewm_jax.geometry import depth_images
 from pewm_jax.nn import placement
@@ -93,19 +93,12 @@ def mix(
 ) -> tuple[Array, Array]:
     """Blend decoded frames with the rendered memory by the codec's gate.
 
-    Args:
-        model: the model, whose codec has a gate.
-        params: the world model's parameters.
-        rgb_BTHWC: (B, T, H, W, 3) decoded colours in [−1, 1].
-        depth_BTHW: (B, T, H, W) decoded depth, metres.
-        view: (B, T) the rendered memory; the first 3 of its features are colours.
-
-    Returns:
-        Colours and depth, unchanged where nothing is rendered.
+    Colours are in [−1, 1], depth in metres; the first 3 features of the (B, T) view are colours.
+    Pixels are unchanged where nothing is rendered.
     """
 
     def pictures(rgb: Array, depth: Array) -> Array:
-        four = jnp.concatenate([rgb, signal_from_depth(model.clip, depth)[..., None]], -1)
+        four = rgbd_signal(model.clip, rgb, depth)
         return four.reshape(-1, *four.shape[-3:])
 
     made = model.codec.mix(  # type: ignore[attr-defined]

@@ -21,6 +21,11 @@ def signal_from_depth(config: ClipConfig, depth: Array) -> Array:
     return 2 * share - 1
 
 
+def rgbd_signal(config: ClipConfig, rgb: Array, depth: Array) -> Array:
+    """Return (..., 4) colour in [−1, 1] and the signal of metric depth."""
+    return jnp.concatenate([rgb, signal_from_depth(config, depth)[..., None]], -1)
+
+
 def depth_from_signal(config: ClipConfig, signal: Array) -> Array:
     """Map [−1, 1] to metric depth: the inverse of ``signal_from_depth`` between near and far."""
     share = (jnp.clip(signal, -1, 1) + 1) / 2

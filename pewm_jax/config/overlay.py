@@ -66,10 +66,8 @@ def with_kind(default: T, path: Sequence[str], name: str) -> T:
     """Replace a section by settings of another kind, with the settings that both kinds have.
 
     The result is not validated, because later changes may make it fit. Nothing changes if there is
-    no section with kinds at the path.
-
-    Raises:
-        ConfigError: there is no such kind, or it cannot be created from defaults.
+    no section with kinds at the path. A ``ConfigError`` refuses an unknown kind or one without
+    defaults.
     """
     section = section_with_kinds(default, path)
     return default if section is None else _replaced(default, path, _as_kind(section, name))

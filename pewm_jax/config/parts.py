@@ -193,10 +193,12 @@ class Codec(Settings):
     def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
         """Encode a video.
 
-        Args: params: its parameters. video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3
-            where depth is encoded as grey. condition: whether the latents condition the denoiser.
-            CogVideoX-1.5's image-to-video model divides such latents by the scaling factor; others
-            multiply.
+        Args:
+            params: its parameters.
+            video_BTHWC: (B, q·k + 1, H, W, C) float in [−1, 1]; C is 3 where depth is encoded as
+                grey.
+            condition: whether the latents condition the denoiser. CogVideoX-1.5's image-to-video
+                model divides such latents by the scaling factor; others multiply.
 
         Returns:
             (B, k + 1, H/s, W/s, C') latents.
@@ -372,9 +374,13 @@ class Reader(Settings):
     ) -> Any:
         """Return the ``models.interface.Readers`` that the backbone calls for a batch of clips.
 
-        Args: model: the model. params: its parameters. readout: the memory's readout of each clip,
-            leading axis B, with the parts that the class attributes name. camera: (B, T) cameras of
-            the clips. rays_BthwC: their Plücker rays at the latent rate (``controls.camera.rays``).
+        Args:
+            model: the model.
+            params: its parameters.
+            readout: the memory's readout of each clip, leading axis B, with the parts that the
+                class attributes name.
+            camera: (B, T) cameras of the clips.
+            rays_BthwC: their Plücker rays at the latent rate (``controls.camera.rays``).
         """
         raise NotImplementedError
 
@@ -386,12 +392,15 @@ class Memory(Settings):
     The state of a memory is a pytree of static size, of the type that ``empty`` returns. The
     methods are pure and handle one world: jit and vmap them.
 
-    Attributes: KEEPS_FEATURES: whether it keeps features of the image encoder; else the first three
-        features of a point are its colour. REMEMBERS: whether it ever holds anything.
+    Attributes:
+        KEEPS_FEATURES: whether it keeps features of the image encoder; else the first three
+            features of a point are its colour.
+        REMEMBERS: whether it ever holds anything.
         READ_BY_BLOCKS: whether trained memory blocks read it; else it is the state of its world.
         CLASSES: whether it holds class ids of recorded voxels (``kinds``, ``colours``,
-        ``pictures``). EDITABLE: whether ``erase`` and ``move`` work. GRID_TOLERANCE: the distance,
-        in cells, within which a point counts as held in coverage.
+            ``pictures``).
+        EDITABLE: whether ``erase`` and ``move`` work.
+        GRID_TOLERANCE: the distance, in cells, within which a point counts as held in coverage.
     """
 
     SECTION: ClassVar[str] = "memory"
@@ -471,11 +480,16 @@ class Memory(Settings):
             valid_T: (T,) bool; False frames are ignored.
             observed: False where the frames were imagined.
         """
-        raise NotImplementedError
+        del model, params, memory, frames, features_ThwF, valid_T, observed
+        raise UserError(
+            f"the memory {type(self).__name__} takes no frames by itself: use pewm_jax.start and "
+            "pewm_jax.observe."
+        )
 
     def read(self, model: Any, memory: Any, camera: Camera) -> MapTokens:
         """Return the M = ``tokens`` tokens that condition one clip of (T,) cameras."""
-        raise NotImplementedError
+        del model, memory, camera
+        raise UserError(f"the memory {type(self).__name__} has no tokens that could be read.")
 
     def to_points(self, model: Any, memory: Any) -> tuple[Array, Array, Array]:
         """Return the whole memory as ``(points_world_V3, features_VF, valid_V)``; V is static."""

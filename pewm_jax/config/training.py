@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pewm_jax.errors import ConfigError, is_pattern, require, require_fields, require_positive
 
@@ -118,6 +118,9 @@ class StageConfig:
 class TrainSettings:
     """Settings of all trainings; each world adds a ``StageConfig`` for each of its stages."""
 
+    ZERO: ClassVar[dict[str, str]] = {}
+    """Settings that must be 0 for a task → the reason."""
+
     run: str = "runs/demo"
     """Folder of this run: checkpoints, logs, images, report."""
     start: str = ""
@@ -197,6 +200,9 @@ class TrainSettings:
             (lambda x: 0 <= x <= 1, "a share of clips in [0, 1]", "hidden", "chained"),
         ):
             require_fields(self, "train", accepts, hint, *names)
+        for name, reason in self.ZERO.items():
+            value = getattr(self, name)
+            require(value == 0, f"train.{name} is {value}: {reason}, use 0.")
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")
 

@@ -334,21 +334,11 @@ class World(Task):
         remember: bool = True,
         memory: bool = True,
     ) -> tuple[WorldState, Frames]:
-        """Imagine n ≥ 1 frames.
+        """Imagine n ≥ 1 frames; ``pewm_jax.worlds.imagine`` documents arguments and result.
 
-        Args:
-            params: the parameters.
-            state: the world so far.
-            control: discrete actions (n,), planar ones (n, 3), a ``Camera`` (n,) or a ``Control``;
-                ``worlds.control.control_of`` turns all of them into cameras and actions.
-            key: randomness.
-            remember: whether imagined frames enter the memory; if not, ``state.map`` is returned as
-                it is.
-            memory: False ignores the memory.
-
-        Returns:
-            The state whose present frame is the last one, and the n frames, colours float32 in
-            [−1, 1]; depth is zero where ``capabilities.depth`` is False.
+        ``worlds.control.control_of`` turns every form of control into cameras and actions. If
+        ``remember`` is False, ``state.map`` is returned as it is. Depth is zero where
+        ``capabilities.depth`` is False.
         """
 
     def imagine_many(
@@ -392,9 +382,10 @@ class World(Task):
     def memory_points(self, memory: Any) -> tuple[Array, Array, Array, Array | None]:
         """Return the memory as points, for the capability ``points``.
 
-        Returns: ``(points_V3, features_VF, valid_V, observed_V)``: positions in metres; features,
-            which ``point_colours`` turns into colours; which of the V slots are used; and which
-            points were observed, not imagined, or None if the memory does not distinguish them.
+        Returns:
+            ``(points_V3, features_VF, valid_V, observed_V)``: positions in metres; features, which
+            ``point_colours`` turns into colours; which of the V slots are used; and which points
+            were observed, not imagined, or None if the memory does not distinguish them.
         """
         raise NotImplementedError(f"{type(self).__name__} lists no points.")
 

@@ -304,14 +304,11 @@ def follow(
     *,
     every_step: bool = False,
 ) -> Array:
-    """Scan the update over the steps.
+    """Scan the update over all steps from (B, …) standard normal noise.
 
-    Args:
-        rows: the coefficients of all steps.
-        denoise: ``(x_t, levels_B, weight) -> x0``.
-        start: (B, …) standard normal.
-        fresh: ``fresh(k)`` is the noise that step k adds; None for a sampler that adds none.
-        every_step: return the sample after every step, (steps, B, …), not only the last one.
+    ``denoise`` is ``(x_t, levels_B, weight) -> x0``; ``fresh(k)`` is the noise that step k adds,
+    None for a sampler that adds none. ``every_step`` returns (steps, B, …), the sample after every
+    step.
     """
 
     def step(carry, inputs):

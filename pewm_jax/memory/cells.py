@@ -98,18 +98,11 @@ def choose(
     size: tuple[int, int],
     wide_V: Array | None = None,
 ) -> Array:
-    """Return (≤ ``memory.tokens``,) indices of the points that condition one clip.
+    """Return (≤ ``memory.tokens``,) indices of the (V, 3) points that condition one clip.
 
-    By ``memory.choose``: points that the clip's cameras can see first (``geometry.zbuffer``), or
-    points in view by their distance (``in_view_first``).
-
-    Args:
-        config: gives order, number and the size of a cell.
-        points_V3: (V, 3) world points, metres.
-        valid_V: (V,) bool.
-        camera: (T,) cameras of the clip.
-        size: image height and width in pixels.
-        wide_V: (V,) widths of the points, metres; by default those of a cell.
+    By ``memory.choose``: points that the (T,) cameras can see first (``geometry.zbuffer``), or
+    points in view by their distance (``in_view_first``). ``size`` is the images' height and width
+    in pixels; ``wide_V`` are widths of the points, metres, by default those of a cell.
     """
     if config.choose == "nearest":
         return in_view_first(points_V3, valid_V, camera, size, config.tokens)
@@ -154,12 +147,9 @@ def find(cell_V: Array, cell_P: Array) -> tuple[Array, Array]:
 
 
 def admit(cell_V: Array, cell_P: Array, no_cell: int) -> tuple[Array, Array]:
-    """Add cells to a map's list while there is room, in the order of their numbers.
+    """Add cells to a map's sorted list while there is room, in the order of their numbers.
 
-    Args:
-        cell_V: (V,) the cells of a map, sorted, ``no_cell`` where a slot is free.
-        cell_P: (P,) cells seen, in any order, with repetitions, ``no_cell`` for points to ignore.
-        no_cell: the number that stands for no cell.
+    ``cell_P`` are cells in any order, with repetitions; ``no_cell`` marks free slots and no cell.
 
     Returns:
         ``(cell_V, dropped)``: the new list, and the number of distinct new cells that did not fit.
@@ -189,16 +179,9 @@ def maximum_over_blocks(
 ) -> Array:
     """Scatter-max ``count`` ≤ ``size`` rows, block by block, so that only one block of rows exists.
 
-    Args:
-        features_VF: (V, F) the rows so far.
-        count: () number of rows to read.
-        size: the largest number of rows.
-        read: ``(start, b)`` → ``(slot_b, rows_bF)``, b rows from ``start`` on; rows with slot V are
-            ignored. A row may be requested twice, and so may rows beyond ``count``.
-
-    Returns:
-        (V, F) in the dtype of ``features_VF``. Maxima are computed in float32; rounding preserves
-        order, so the result is that of the narrower dtype.
+    ``read(start, b)`` returns ``(slot_b, rows_bF)``, b rows from ``start`` on; rows with slot V are
+    ignored. A row may be requested twice, and so may rows beyond ``count``. Maxima are computed in
+    float32; rounding preserves order, so the result is that of the narrower dtype.
     """
     exact = jnp.promote_types(features_VF.dtype, jnp.float32)
 

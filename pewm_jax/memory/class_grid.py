@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, ClassVar, Literal, NoReturn
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,7 @@ from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import cells
 from pewm_jax.registry import part
-from pewm_jax.types import Array, Camera, Frames, Params, View
+from pewm_jax.types import Array, Camera, View
 
 UNKNOWN = -1
 """The id of a cell of which nothing is known."""
@@ -94,13 +94,8 @@ def paste(
     """Insert a piece into a grid; its occupied cells replace those of the grid.
 
     Each cell takes the cell of the piece that its centre comes from (inverse warping), so a rotated
-    piece has no holes. Quarter turns and shifts by whole cells are exact.
-
-    Args:
-        config: the settings of both.
-        grid: the grid.
-        piece: from ``copy``, or any grid of the same cell size.
-        transform: (4, 4) rigid, metres; None for the identity.
+    piece has no holes. Quarter turns and shifts by whole cells are exact. The piece may be any grid
+    of the same cell size; ``transform`` is rigid, (4, 4), metres.
 
     Raises:
         UserError: the transform is not a rigid 4×4.
@@ -266,28 +261,6 @@ class GridConfig(Memory):
         there = seen.ids_L[..., 0] > 0
         colours = jnp.where(there[..., None], _colours(self)[seen.ids_L[..., 0]], 0)
         return View(colours, seen.distance_L[..., 0], there)
-
-    def insert(
-        self,
-        model: AssembledModel,
-        params: Params,
-        memory: ClassGrid,
-        frames: Frames,
-        features_ThwF: Array,
-        valid_T: Array | None = None,
-        *,
-        observed: bool = True,
-    ) -> NoReturn:
-        """Refuse: the networks of the world predict the cells."""
-        del model, params, memory, frames, features_ThwF, valid_T, observed
-        raise UserError(
-            "A grid of classes takes no frames by itself: use pewm_jax.start and pewm_jax.observe."
-        )
-
-    def read(self, model: AssembledModel, memory: ClassGrid, camera: Camera) -> NoReturn:
-        """Refuse: nothing attends to the cells."""
-        del model, memory, camera
-        raise UserError("A grid of classes has no tokens: the world persist renders it by rays.")
 
     def erase(self, model: AssembledModel, memory: ClassGrid, box_23: Array) -> ClassGrid:
         """Empty a box; see ``erase``."""

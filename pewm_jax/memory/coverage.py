@@ -59,16 +59,9 @@ def coverage(
     """Count the pixels seen before that are remembered, chosen, attended to and rendered.
 
     A place is a cell of the memory's grid; for surfels, whose cells are about as small as pixels,
-    that cell or one beside it.
-
-    Args:
-        model: the model.
-        memory: the memory of one world.
-        tokens: the clip's tokens (``Memory.read``).
-        frames: T true frames of the clip, with depth.
-        seen_THW: (T, H, W) bool, pixels seen before.
-        reader: settings of the attention, by default the memory's reader; with another kind of
-            reader all chosen tokens count as attended to.
+    that cell or one beside it. ``frames`` are T true frames of the clip, ``tokens`` the clip's
+    (``Memory.read``). The reader is by default the memory's; with one that is not attention all
+    chosen tokens count as attended to.
     """
     depth = jnp.asarray(frames.depth_THW)
     _, height, width = depth.shape

@@ -193,16 +193,8 @@ def build(
 ) -> FeatureCache:
     """Compute the features of every frame of a split, or continue an interrupted build.
 
-    Frames are spread over all devices. Each episode's file is written atomically.
-
-    Args:
-        config: the encoder.
-        params: the encoder's parameters, empty if it has none.
-        data: a finished split.
-        out: the folder to fill.
-        dtype: dtype of the stored features.
-        batch: frames encoded at once, rounded up to a multiple of the devices.
-        log: shows a progress line.
+    Frames are spread over all devices, ``batch`` of them at once (rounded up to a multiple of the
+    devices). Each episode's file is written atomically; ``log`` shows a progress line.
 
     Raises:
         UserError: the data cannot be read, ``out`` holds another cache or is being filled by

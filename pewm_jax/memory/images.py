@@ -47,12 +47,9 @@ class Snapshots:
 
 
 def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array, Array]:
-    """Choose ``count`` sets greedily: each time the one that covers the most uncovered cells.
+    """Choose ``count`` of X sets of cells greedily: each time the one with most uncovered cells.
 
-    Args:
-        cell_XC: (X, C) the cells of each of X sets, in any order, with repetitions.
-        count: number of sets to choose.
-        nowhere: the number that stands for no cell.
+    ``cell_XC`` has the cells of each set in any order, with repetitions and ``nowhere``.
 
     Returns:
         ``(chosen, gain, missed)``: (count,) indices of the sets in the order of choice (ties go to

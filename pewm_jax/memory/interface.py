@@ -130,15 +130,11 @@ def readout(
     pictures: bool = False,
     view: View | None = None,
 ) -> MemoryReadout:
-    """Return the part of the memory that the reader needs for one clip.
+    """Return the part of the memory that the reader needs for one clip of (T,) cameras.
 
-    Args:
-        model: the model.
-        memory: the memory.
-        camera: (T,) cameras of the clip, whose intrinsics are for images of its size.
-        params: the world model's parameters; the codec's are used if the reader takes latents.
-        pictures: return the view even if the reader does not take it.
-        view: the rendering for these cameras, if it exists already.
+    ``params`` are the world model's; the codec's are used if the reader takes latents. With
+    ``pictures`` the view is returned even if the reader does not take it; ``view`` is the
+    rendering, if it exists already.
     """
     reader = model.memory.reader
     seen, encoded = None, None
@@ -176,16 +172,10 @@ def from_context(
     valid_S: Array,
     features_ShwF: Array | None = None,
 ) -> Memory:
-    """Build the memory of one world from the frames it has seen.
+    """Build the memory of one world from the S frames it has seen, colours in [−1, 1].
 
-    The grid is centred on the last valid frame's camera.
-
-    Args:
-        model: the model.
-        params: the world model's parameters; those of ``Encoder.weights`` are used.
-        context: S frames of one world, colours in [−1, 1].
-        valid_S: (S,) bool, False frames are ignored.
-        features_ShwF: (S, h, w, F) the encoder's features of the frames, if they are known.
+    The grid is centred on the last valid frame's camera. ``features_ShwF`` are the encoder's, if
+    they are known.
     """
     last = jnp.argmax(jnp.where(valid_S, jnp.arange(valid_S.shape[0]), -1))
     memory = model.memory.empty(model, context.camera.world_from_camera[last, :3, 3])

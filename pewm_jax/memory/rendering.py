@@ -63,13 +63,13 @@ def splat(
         features = jnp.where(seen[:, None], features_VF[jnp.minimum(index, count - 1)], 0)
         return features, jnp.where(seen, depth, 0), seen
 
-    features, depth, seen = jax.vmap(render)(camera)
-    frames = depth.shape[0]
-    return View(
-        features.reshape(frames, height, width, -1),
-        depth.reshape(frames, height, width),
-        seen.reshape(frames, height, width),
-    )
+    return _as_images(*jax.vmap(render)(camera), height, width)
+
+
+def _as_images(features: Array, depth: Array, seen: Array, height: int, width: int) -> View:
+    """Return (T, H·W, …) pixels as images."""
+    shape = (len(depth), height, width)
+    return View(features.reshape(*shape, -1), depth.reshape(shape), seen.reshape(shape))
 
 
 def splat_surfels(
@@ -87,30 +87,20 @@ def splat_surfels(
 ) -> View:
     """Render points that have a size, so that near surfaces hide far ones.
 
-    A point covers the pixels whose centres lie in a square of its size at its depth around it, and
-    always the pixel that it falls on. The nearest point that covers a pixel is its front; points
-    behind the front by more than a tolerance are hidden. Where no point in front falls on or beside
-    a covered pixel, the covering point is shown.
+    A point covers the pixels whose centres lie in a square of its size (metres) at its depth around
+    it, at most ``most`` across and down, and always the pixel that it falls on. The nearest point
+    that covers a pixel is its front; points behind the front by more than a tolerance are hidden.
+    Where no point in front falls on or beside a covered pixel, the covering point is shown.
+
+    ``average`` shows the mean of all points that are not hidden, each shared bilinearly by the four
+    pixels around it; else the nearest point that falls on the pixel is shown. ``normals_V3`` are
+    the directions that points face, 0 for both sides. A point that faces away hides what is behind
+    it and is not shown: nothing is seen there, at its depth.
 
     Points in neighbouring slots are taken to be neighbours in the world, as in a memory: if the
     blocks of ``BLOCK`` slots that reach into a camera's view are at most ``SHARE`` of all, only
     they are drawn. That changes no result. It is a branch, both sides of which ``jax.vmap``
     computes: render a batch with ``jax.lax.map``.
-
-    Args:
-        points_V3: positions.
-        features_VF: features.
-        size_V: (V,) widths, metres.
-        valid_V: which points exist.
-        camera: cameras.
-        height: of the images.
-        width: of the images.
-        most: pixels that a point covers at most, across and down.
-        average: show the mean of all points that are not hidden, each shared bilinearly by the four
-            pixels around it; else the nearest point that falls on the pixel.
-        normals_V3: (V, 3) directions that points face, 0 for both sides. A point that faces away
-            hides what is behind it and is not shown: nothing is seen there, at its depth. None: all
-            face both sides.
     """
     sides = () if normals_V3 is None else (normals_V3,)
     points_V3, features_VF, size_V, valid_V, *sides = _whole_blocks(
@@ -147,13 +137,7 @@ def splat_surfels(
         )
 
     # Frame after frame: what one needs fits a processor's cache, which nine do not.
-    features, depth, seen = jax.lax.map(one, jax.tree.map(jnp.asarray, camera))
-    frames = depth.shape[0]
-    return View(
-        features.reshape(frames, height, width, -1),
-        depth.reshape(frames, height, width),
-        seen.reshape(frames, height, width),
-    )
+    return _as_images(*jax.lax.map(one, jax.tree.map(jnp.asarray, camera)), height, width)
 
 
 def splat_cells(

@@ -110,14 +110,9 @@ def insert(
     cell_THW: Array,
     features_ThwF: Array,
 ) -> tuple[Array, Array, Array]:
-    """Insert the upsampled features of pixels into sorted cells.
+    """Insert the upsampled features of pixels, whose cells are ``cell_THW``, into sorted cells.
 
-    Args:
-        config: the map's settings.
-        cell_V: (V,) the cells of the map.
-        features_VF: (V, F) their features.
-        cell_THW: (T, H, W) the cell of each pixel, ``nowhere`` for pixels to ignore.
-        features_ThwF: (T, h, w, F) patch features.
+    Pixels with the cell ``nowhere`` are ignored.
 
     Returns:
         ``(cell_V, features_VF, dropped)``.

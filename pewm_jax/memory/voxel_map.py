@@ -36,27 +36,9 @@ from jax.typing import DTypeLike
 from pewm_jax.config import AssembledModel, Memory, UserError
 from pewm_jax.geometry.cameras import invert_rigid, transform_points
 from pewm_jax.memory import cells, voxel_files, voxel_frames
-from pewm_jax.memory.voxel_files import load, save
 from pewm_jax.types import Array, Camera, Frames, MapTokens, Params, VoxelMap
 
-__all__ = [
-    "VoxelConfig",
-    "VoxelMap",
-    "copy",
-    "count",
-    "empty",
-    "erase",
-    "export",
-    "insert",
-    "insert_frames",
-    "load",
-    "merge",
-    "move",
-    "paste",
-    "save",
-    "to_points",
-    "tokens",
-]
+load, save = voxel_files.load, voxel_files.save
 
 
 def empty(
@@ -121,18 +103,12 @@ def insert_frames(
     features_ThwF: Array,
     valid_T: Array | None = None,
 ) -> VoxelMap:
-    """Insert posed depth frames: upsampling, unprojection and maximum in one pass.
+    """Insert T posed depth frames: upsampling, unprojection and maximum in one pass.
 
     The result equals upsampling the features to all pixels and inserting every pixel's point, up to
     rounding of the interpolation. The upsampled features are never stored (see ``voxel_frames``).
-
-    Args:
-        config: the map's settings.
-        voxels: the map.
-        frames: T frames; pixels without depth are ignored.
-        features_ThwF: (T, h, w, F) features of a grid of patches that covers each frame, float32
-            or bfloat16; they are upsampled bilinearly in float32, patch centres at half-integers.
-        valid_T: (T,) bool, False frames are ignored.
+    The (T, h, w, F) features are those of a grid of patches that covers each frame; they are
+    upsampled bilinearly in float32, patch centres at half-integers.
 
     Raises:
         UserError: frames, features and the map's channels do not fit together.
@@ -182,11 +158,6 @@ def merge(config: Memory, a: VoxelMap, b: VoxelMap) -> VoxelMap:
     )
 
 
-def count(voxels: VoxelMap) -> Array:
-    """Return () int32, the number of occupied cells."""
-    return voxels.occupied
-
-
 def to_points(config: Memory, voxels: VoxelMap) -> tuple[Array, Array, Array]:
     """Return all slots as ``(points_world_V3, features_VF, valid_V)``; free slots are 0."""
     valid = voxels.cell_of_slot_V < cells.nowhere(config)
@@ -234,15 +205,11 @@ def export(
     style: Literal["cubes", "points"] = "cubes",
     colours_V3: Array | None = None,
 ) -> None:
-    """Write the occupied cells with their colours to a file, atomically.
+    """Write the occupied cells with their colours to a file, atomically; its folder is created.
 
-    Args:
-        config: the map's settings.
-        voxels: one map.
-        path: the file, whose suffix ``.ply`` or ``.glb`` is the format; its folder is created.
-        style: `cubes` or `points`.
-        colours_V3: (V, 3) colours in [−1, 1] of all slots. By default ``Encoder.colours``: the
-            true colours if features are colours, else three principal components.
+    The suffix ``.ply`` or ``.glb`` is the format. Colours, (V, 3) in [−1, 1] of all slots, are by
+    default ``Encoder.colours``: the true colours if features are colours, else three principal
+    components.
 
     Raises:
         UserError: the suffix is unknown, or the map is empty.
@@ -278,13 +245,7 @@ def paste(
     Each cell of the map takes the cell of the piece that its centre comes from (inverse warping),
     so a rotated piece has no holes and does not grow. Quarter turns and shifts by whole cells are
     exact. Cells that do not fit are counted as dropped, and cells whose centre leaves the grid as
-    outside.
-
-    Args:
-        config: settings of both.
-        voxels: the map; its cells have precedence where the capacity is full.
-        piece: from ``copy``, or any map of the same cell size.
-        transform: (4, 4) rigid, metres; None for the identity.
+    outside. The piece may be any map of the same cell size; ``transform`` is rigid, (4, 4), metres.
 
     Raises:
         UserError: the transform is not a rigid 4×4.

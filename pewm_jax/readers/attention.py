@@ -25,7 +25,14 @@ from pewm_jax.nn.tokens import (
     text_tokens,
     video_tokens,
 )
-from pewm_jax.readers.geometry import Sightings, patch_pixels, sightings, sinusoid_3d
+from pewm_jax.readers.geometry import (
+    Sightings,
+    init_stacked,
+    pad_time,
+    patch_pixels,
+    sightings,
+    sinusoid_3d,
+)
 from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import Array, Camera, MemoryReadout, Params
 
@@ -146,9 +153,7 @@ class AttentionConfig(Reader):
             seen,
         )
         block = _block(model, TokenLayout(1, 0, 1, 1))
-        blocks = jax.vmap(lambda k: block.init(k, *example)["params"])(
-            jax.random.split(blocks_key, places.count)
-        )
+        blocks = init_stacked(block, blocks_key, places.count, example)
         rays, channels = jnp.zeros((1, _ray_channels(model))), jnp.zeros((1, token_channels(model)))
         return {
             "camera": camera.init(camera_key, rays)["params"],
@@ -166,8 +171,7 @@ class AttentionConfig(Reader):
     ) -> Readers:
         """Embed rays and map tokens, and select the tokens that each camera attends to."""
         places, dtype = model.backbone.places, jnp.dtype(model.dtype)
-        missing = -rays_BthwC.shape[1] % places.patch_t
-        rays = jnp.concatenate([rays_BthwC[:, :1]] * missing + [rays_BthwC], 1).astype(dtype)
+        rays = pad_time(rays_BthwC, places.patch_t).astype(dtype)
         layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
         camera_layer, token_layer = _embeddings(model)
         patches = patchify(rays, places.patch, places.patch_t)

@@ -24,7 +24,7 @@ from pewm_jax.geometry import zbuffer
 from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
 from pewm_jax.geometry.plucker import fold_frames
 from pewm_jax.nn import placement
-from pewm_jax.types import Array, Camera
+from pewm_jax.types import Array, Camera, Params
 
 MARGIN = 0.25
 """Cells may project outside the image by up to this share of its size."""
@@ -54,6 +54,17 @@ class Sightings:
     place_tqJ3: Array
     visible_tqJ: Array
     query_angles_nR: Array
+
+
+def pad_time(x_BthwC: Array, patch_t: int) -> Array:
+    """Repeat the first latent frame in front, up to a multiple of ``patch_t``, as the denoiser."""
+    missing = -x_BthwC.shape[1] % patch_t
+    return jnp.concatenate([x_BthwC[:, :1]] * missing + [x_BthwC], 1)
+
+
+def init_stacked(block: Any, key: Array, count: int, example: tuple[Any, ...]) -> Params:
+    """Return random parameters of ``count`` blocks, stacked, for example inputs."""
+    return jax.vmap(lambda k: block.init(k, *example)["params"])(jax.random.split(key, count))
 
 
 def group_latents(cameras_tqX: Array, patch_t: int) -> Array:
@@ -106,14 +117,7 @@ def sightings(
 
     Each camera gets J = ``looks`` tokens in view: first visible ones, every part of its image in
     turn (``geometry.zbuffer``; not with ``memory.choose`` nearest), then the nearest. Tokens behind
-    much nearer ones come last.
-
-    Args:
-        model: the model.
-        config: the reader.
-        camera: (B, T) cameras of the clips.
-        points_M3: (B, M, 3) cell centres in the world.
-        valid_M: (B, M) bool.
+    much nearer ones come last. ``points_M3`` are (B, M, 3) in the world, cameras (B, T).
     """
     clip, patch = model.clip, patch_pixels(model)
     rows, columns = clip.height // patch, clip.width // patch

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import flax.linen as nn
@@ -40,15 +41,9 @@ MIXED: placement.Names = ("batch", "tokens", "heads")
 def masked_attention(logits: Array, mask: Array, sink_K: Array, values: Array) -> Array:
     """Attend to unmasked tokens, or to none.
 
-    The softmax over the last axis has one extra entry per head whose value is zero (the sink). A
-    query may attend to it instead of to tokens; if all tokens are masked the result is zero, never
-    NaN.
-
-    Args:
-        logits: (..., K, n, M) float32.
-        mask: broadcastable to logits, True where a token may be attended to.
-        sink_K: (K,) logit of the sink.
-        values: (..., K, M, d).
+    The softmax over the last axis has one extra entry per head, with the logit ``sink_K``, whose
+    value is zero. A query may attend to it instead of to tokens; if all tokens are masked the
+    result is zero, never NaN. Logits are (..., K, n, M) float32, values (..., K, M, d).
     """
     sink = sink_K[:, None, None].astype(jnp.float32)
     logits = jnp.where(mask, logits, -jnp.inf)
@@ -56,6 +51,12 @@ def masked_attention(logits: Array, mask: Array, sink_K: Array, values: Array) -
     weights = jnp.exp(logits - top)
     total = weights.sum(-1, keepdims=True) + jnp.exp(sink - top)
     return (weights / total).astype(values.dtype) @ values
+
+
+def _project(video_BND: Array, memory_BMD: Array, heads: int, width: int) -> Iterator[Array]:
+    """Return queries of video tokens, keys and values of map tokens, split into heads."""
+    for name, x in (("to_q", video_BND), ("to_k", memory_BMD), ("to_v", memory_BMD)):
+        yield layers.split_heads(modules.dense(width, video_BND.dtype, name)(x), heads)
 
 
 class SinusoidAttention(nn.Module):
@@ -67,10 +68,8 @@ class SinusoidAttention(nn.Module):
     @nn.compact
     def __call__(self, video_BND: Array, memory_BMD: Array, valid_BM: Array) -> Array:
         """Return (B, N, K·d)."""
-        dtype, width = video_BND.dtype, self.heads * self.head_dim
-        q = layers.split_heads(modules.dense(width, dtype, "to_q")(video_BND), self.heads)
-        k = layers.split_heads(modules.dense(width, dtype, "to_k")(memory_BMD), self.heads)
-        v = layers.split_heads(modules.dense(width, dtype, "to_v")(memory_BMD), self.heads)
+        width = self.heads * self.head_dim
+        q, k, v = _project(video_BND, memory_BMD, self.heads, width)
         q, k = (modules.layer_norm(x, f"norm_{n}", 1e-6) for x, n in ((q, "q"), (k, "k")))
         sink = self.param("sink", modules.zeros, (self.heads,))
         read = placement.local(_read_all, (QUERIES, KEYS, KEYS, ("batch",), ("heads",)), MIXED)
@@ -107,9 +106,7 @@ class ProjectiveAttention(nn.Module):
         width = heads * head_dim
         camera_of_head = np.arange(heads) % seen.angles_tqJR.shape[2]
 
-        q = layers.split_heads(modules.dense(width, dtype, "to_q")(video_BND), heads)
-        k = layers.split_heads(modules.dense(width, dtype, "to_k")(memory_BMD), heads)
-        v = layers.split_heads(modules.dense(width, dtype, "to_v")(memory_BMD), heads)
+        q, k, v = _project(video_BND, memory_BMD, heads, width)
         gain = nn.initializers.constant(0.3)
 
         def norm(x: Array, name: str) -> Array:

@@ -31,6 +31,7 @@ from pewm_jax.models.interface import Readers
 from pewm_jax.nn import layers, modules, placement
 from pewm_jax.nn.tokens import TokenLayout, patchify, text_tokens, video_tokens
 from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.geometry import init_stacked, pad_time
 from pewm_jax.types import Array, Camera, MemoryReadout, Params, View
 
 
@@ -214,9 +215,8 @@ class RenderConfig(Reader):
                 jnp.zeros((1, 1, self.picture_width)),
             )
             block = RenderBlock(self.mlp_ratio, TokenLayout(1, 0, 1, 1))
-            params["blocks"] = jax.vmap(lambda k: block.init(k, *example)["params"])(
-                jax.random.split(jax.random.fold_in(key, len(widths)), places.count)
-            )
+            blocks_key = jax.random.fold_in(key, len(widths))
+            params["blocks"] = init_stacked(block, blocks_key, places.count, example)
         return {"render": params}
 
     def prepare(
@@ -234,9 +234,7 @@ class RenderConfig(Reader):
         layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
 
         read_BthwC, seen_B = cells(model, weights, readout)
-        missing = -read_BthwC.shape[1] % places.patch_t
-        read_BthwC = jnp.concatenate([read_BthwC[:, :1]] * missing + [read_BthwC], 1)
-        patches = patchify(read_BthwC, places.patch, places.patch_t)
+        patches = patchify(pad_time(read_BthwC, places.patch_t), places.patch, places.patch_t)
         picture: Array = embed("embed_2", jax.nn.silu(embed("embed_1", patches)))
         # A clip whose cameras see nothing of the memory is left alone.
         shown = (seen_B | (not model.memory.REMEMBERS))[:, None, None]

@@ -33,6 +33,7 @@ import jax
 from jax.sharding import PartitionSpec
 
 from pewm_jax.config import Config, Task, UserError, World
+from pewm_jax.config.world import require_capabilities
 from pewm_jax.types import Array, Frames, Params, WorldState
 from pewm_jax.worlds import checks, forms
 from pewm_jax.worlds.stages import Stage
@@ -44,17 +45,14 @@ def model_of(config: Any) -> Any:
 
 
 def require_world(model: Task, who: str) -> World:
-    """Return the settings of a world, or refuse a training task that imagines nothing.
-
-    Args:
-        model: the settings.
-        who: the function that needs a world, for the message: ``"start()"``.
+    """Return the settings of a world; ``who`` needs it, for the message: ``"start()"``.
 
     Raises:
-        UserError: it is a training task alone, or its capabilities are invalid.
+        UserError: it is a training task that imagines nothing, or its capabilities are invalid.
     """
     if not isinstance(model, World):
         raise UserError(f"{who} got a run that {model.INSTEAD}.")
+    require_capabilities(model)
     return model
 
 
@@ -182,8 +180,7 @@ def imagine_many(
 
     Returns:
         ``(state, frames)``: K present frames with the shared memory, which is not copied, and
-        (K, n) imagined frames. Under jit, vmap and grad the frames of a candidate with an unknown
-        action are NaN, as for ``imagine``; the other candidates are not affected.
+        (K, n) imagined frames. Under tracing an unknown action affects only its candidate.
 
     Raises:
         UserError: as for ``imagine``, or the number of keys is not that of the candidates.
@@ -216,7 +213,7 @@ def _start(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    state = model.start(forms.own(model, params), checks.in_metres(frames, depth_scale))
+    state = model.start(forms.in_world_form(model, params), checks.in_metres(frames, depth_scale))
     name = "observe" if type(model).start is World.start else "start"
     return checks.returned_state(model, name, state, (1, *frames.depth_THW.shape[1:]))
 
@@ -229,11 +226,13 @@ def _observe(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    own, frames = forms.own(model, params), checks.in_metres(frames, depth_scale)
+    own, frames = forms.in_world_form(model, params), checks.in_metres(frames, depth_scale)
     after = model.observe(own, state, frames)
     after = checks.returned_state(model, "observe", after, (1, *frames.depth_THW.shape[1:]))
     ok = checks.valid((), state.frame.camera)
-    return WorldState(checks.poisoned(ok, after.frame), checks.kept(ok, after.map, state.map))
+    return WorldState(
+        checks.nan_unless(ok, after.frame), checks.memory_if(ok, after.map, state.map)
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("remember", "memory"), inline=True)
@@ -248,13 +247,13 @@ def _imagine(
     memory: bool,
 ) -> tuple[WorldState, Frames]:
     """Imagine; without ``remember`` the state has no memory: the caller's is not copied."""
-    own = forms.own(model, params)
+    own = forms.in_world_form(model, params)
     found = model.imagine(own, state, control, key, remember=remember, memory=memory)
     present, count = state.frame.depth_THW.shape, checks.steps_of(control)
     after, frames = checks.returned_frames(model, "imagine", found, present, count)
     ok = checks.valid(control, state.frame.camera)
-    kept = checks.kept(ok, after.map, state.map) if remember else None
-    return WorldState(checks.poisoned(ok, after.frame), kept), checks.poisoned(ok, frames)
+    kept = checks.memory_if(ok, after.map, state.map) if remember else None
+    return WorldState(checks.nan_unless(ok, after.frame), kept), checks.nan_unless(ok, frames)
 
 
 @functools.partial(jax.jit, static_argnums=0, static_argnames=("memory", "last"), inline=True)
@@ -271,7 +270,7 @@ def _imagine_many(
 ) -> tuple[Frames, Frames]:
     """Return (K, 1) present frames, and (K, n) imagined ones or the last of them."""
     shown = {} if views is None else {"views": views}
-    own = forms.own(model, params)
+    own = forms.in_world_form(model, params)
     size, count = state.frame.depth_THW.shape, checks.steps_of(controls, 1)
     if type(model).imagine_many is World.imagine_many:  # refuse a wrong ``imagine`` by its name
         imagine_one = functools.partial(model.imagine, remember=False, memory=memory)
@@ -282,7 +281,7 @@ def _imagine_many(
     present, count = (keys.shape[0], *size), 1 if last else count
     after, frames = checks.returned_frames(model, "imagine_many", found, present, count)
     ok = checks.valid(controls, state.frame.camera, leading=1)
-    return checks.poisoned(ok, after.frame), checks.poisoned(ok, frames)
+    return checks.nan_unless(ok, after.frame), checks.nan_unless(ok, frames)
 
 
 def to_compare(model: Config | Task, state: WorldState) -> WorldState:
@@ -296,7 +295,7 @@ def views(model: Config | Task, params: Params, state: WorldState) -> Callable[[
     It runs on the host, not under jit, for candidates of this state; None if they share no views.
     """
     model = require_world(model_of(model), "views()")
-    return model.views(forms.own(model, params), state)
+    return model.views(forms.in_world_form(model, params), state)
 
 
 def init(model: Any, key: Array) -> Params:
@@ -331,7 +330,7 @@ def memory_points(
 def erase(model: Config | Task, params: Params, state: WorldState, box_23: Array) -> WorldState:
     """Return a world that forgot what is in a box; see ``World.erase``."""
     model = require_world(model_of(model), "erase()")
-    return model.erase(forms.own(model, params), state, box_23)
+    return model.erase(forms.in_world_form(model, params), state, box_23)
 
 
 def move(
@@ -345,7 +344,7 @@ def move(
 ) -> WorldState:
     """Return a world in which what is in a box was moved; see ``World.move``."""
     model = require_world(model_of(model), "move()")
-    return model.move(forms.own(model, params), state, box_23, transform, leave=leave)
+    return model.move(forms.in_world_form(model, params), state, box_23, transform, leave=leave)
 
 
 def coverage(
@@ -353,4 +352,4 @@ def coverage(
 ) -> dict[str, Array]:
     """Return how many pixels seen before the memory holds; see ``World.coverage``."""
     model = require_world(model_of(model), "coverage()")
-    return model.coverage(forms.own(model, params), state, frames, seen_THW)
+    return model.coverage(forms.in_world_form(model, params), state, frames, seen_THW)

@@ -1,7 +1,7 @@
 """Checks of the frames and controls that users give to a world.
 
 Shapes and dtypes are always checked. Values are checked where they are known: not under ``jit``,
-``vmap`` and ``grad``, which trace them. There, ``valid`` and ``poisoned`` turn the result of an
+``vmap`` and ``grad``, which trace them. There, ``valid`` and ``nan_unless`` turn the result of an
 invalid control into NaN. All functions raise ``UserError``; ``who`` is the function that was
 called.
 """
@@ -228,7 +228,7 @@ def valid(control: Any, present: Camera, leading: int = 0) -> Array:
     return found
 
 
-def poisoned(ok: Array, frames: Frames) -> Frames:
+def nan_unless(ok: Array, frames: Frames) -> Frames:
     """Return frames with NaN colours, depth and poses where ``ok``, () or (K,), is False."""
 
     def mark(x: Array) -> Array:
@@ -241,7 +241,7 @@ def poisoned(ok: Array, frames: Frames) -> Frames:
     return Frames(mark(frames.rgb_THWC), mark(frames.depth_THW), camera)
 
 
-def kept(ok: Array, new: Any, old: Any) -> Any:
+def memory_if(ok: Array, new: Any, old: Any) -> Any:
     """Return the new memory, or the old one where ``ok`` is False."""
     if jax.tree.structure(new) != jax.tree.structure(old):
         return new

@@ -15,7 +15,12 @@ import jax.numpy as jnp
 
 from pewm_jax.codecs import gates, rgbd
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.codecs.signals import as_signal, depth_from_signal, signal_from_depth
+from pewm_jax.codecs.signals import (
+    as_signal,
+    depth_from_signal,
+    rgbd_signal,
+    signal_from_depth,
+)
 from pewm_jax.config import (
     BatchSpec,
     ClipConfig,
@@ -54,6 +59,10 @@ GATE = r"codec/gate/.*"
 class CodecTrainConfig(TrainSettings):
     """How the codec is trained: on reconstruction, then on the distribution of its latents."""
 
+    ZERO: ClassVar[dict[str, str]] = {
+        "preview_every": "a codec imagines nothing (pewm-jax evaluate prints its numbers)"
+    }
+
     run: str = "runs/codec"
     """Folder of this run: checkpoints, logs, numbers."""
     preview_every: int = 0
@@ -87,11 +96,6 @@ class CodecTrainConfig(TrainSettings):
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
-        require(
-            self.preview_every == 0,
-            f"train.preview_every is {self.preview_every}: a codec imagines nothing to be shown, "
-            "use 0 (pewm-jax evaluate prints its numbers).",
-        )
         weights = ("gradient_weight", "squared_weight", "lpips_weight")
         names = ("latent_noise", "gate_noise", *weights)
         require_fields(self, "train", lambda value: value >= 0, "0 or more", *names)
@@ -159,8 +163,9 @@ class CodecTask(Task):
     def pictures(self, clip: Clip) -> tuple[Array, Array]:
         """Return a batch's frames as the codec's input, and which pixels count.
 
-        Returns: (2, N, H, W, 3) colour and depth as a grey image, in [−1, 1], and (2, N, H, W, 1):
-            0 where depth was not measured, else 1.
+        Returns:
+            (2, N, H, W, 3) colour and depth as a grey image, in [−1, 1], and (2, N, H, W, 1): 0
+            where depth was not measured, else 1.
         """
         frames = as_signal(clip.frames)
         rgb = frames.rgb_THWC.reshape(-1, *frames.rgb_THWC.shape[-3:])
@@ -180,9 +185,10 @@ class CodecTask(Task):
         measured. With ``train.lpips_weight``, LPIPS of colour is added. The noise of a channel is
         relative to its deviation in the batch, so that larger latents gain nothing.
 
-        Returns: ``(loss, measured)``: of colour ``psnr_rgb`` in decibels and, if it counts,
-            ``lpips``; of depth ``depth_m``, the mean absolute error in metres; all of
-            reconstructions from noise.
+        Returns:
+            ``(loss, measured)``: of colour ``psnr_rgb`` in decibels and, if it counts, ``lpips``;
+            of depth ``depth_m``, the mean absolute error in metres; all of reconstructions from
+            noise.
         """
         assert isinstance(train, CodecTrainConfig)
         truth, counts = self.pictures(clip)
@@ -245,8 +251,9 @@ class CodecTask(Task):
     def rendered(self, clip: Clip) -> tuple[Array, Array]:
         """Render each clip's memory of its context for the clip's frames.
 
-        Returns: ``(rendered_BTHWC, seen_BTHW)``: colour and depth signal (4 channels), and which
-            pixels show anything.
+        Returns:
+            ``(rendered_BTHWC, seen_BTHW)``: colour and depth signal (4 channels), and which pixels
+            show anything.
         """
         height, width = self.clip.height, self.clip.width
 
@@ -254,8 +261,8 @@ class CodecTask(Task):
             context, valid, camera = inputs
             memory = memories.from_context(self, {}, context, valid)  # type: ignore[arg-type]
             view = memories.render(self, memory, camera, height, width)  # type: ignore[arg-type]
-            depth = signal_from_depth(self.clip, view.depth_THW)[..., None]
-            return jnp.concatenate([view.features_THWF[..., :3], depth], -1), view.seen_THW
+            shown = rgbd_signal(self.clip, view.features_THWF[..., :3], view.depth_THW)
+            return shown, view.seen_THW
 
         inputs = (as_signal(clip.context), clip.context_valid_S, clip.frames.camera)
         return jax.lax.map(one, jax.tree.map(jnp.asarray, inputs))
@@ -339,24 +346,19 @@ def score(
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of a gate on decoded frames and the rendered memory.
 
-    Args:
-        model: the model; its clip defines the depth signal.
-        gate: the gate's parameters.
-        rgb_BTHWC: decoded colours.
-        depth_BTHW: decoded depth, metres.
-        shown_BTHWC: colour and depth signal of the memory, 4 channels.
-        seen_BTHW: which pixels show anything.
-        truth: the recorded frames, colours in [−1, 1].
-        perceptual: a weight and the weights of LPIPS, which is then added and measured.
+    Decoded depth is in metres; ``shown_BTHWC`` has colour and depth signal of the memory, 4
+    channels, and ``seen_BTHW`` is True where it shows anything. ``perceptual`` is a weight and the
+    weights of LPIPS, which is then added and measured.
 
-    Returns: ``(loss, measured)``: the logarithm of each frame's squared error plus a little
-        absolute error, of colour and of measured depth, so that frames with few pixels seen before
-        do not outweigh the others; PSNR of colour in decibels, of the gate's result and of the
-        decoded frames, and where anything was rendered also of the rendering; ``depth_m``, the mean
+    Returns:
+        ``(loss, measured)``: the logarithm of each frame's squared error plus a little absolute
+        error, of colour and of measured depth, so that frames with few pixels seen before do not
+        outweigh the others; PSNR of colour in decibels, of the gate's result and of the decoded
+        frames, and where anything was rendered also of the rendering; ``depth_m``, the mean
         absolute error of the gate's depth.
     """
-    decoded = _four(model, rgb_BTHWC, depth_BTHW)
-    wanted = _four(model, truth.rgb_THWC, truth.depth_THW)
+    decoded = rgbd_signal(model.clip, rgb_BTHWC, depth_BTHW)
+    wanted = rgbd_signal(model.clip, truth.rgb_THWC, truth.depth_THW)
     shape = (-1, *wanted.shape[-3:])
     decoded, shown, wanted = (x.reshape(shape) for x in (decoded, shown_BTHWC, wanted))
     decoded = jax.lax.stop_gradient(decoded)
@@ -383,11 +385,6 @@ def score(
         "psnr_rendered": _psnr(shown, wanted, hit),
         "depth_m": (off * measured).sum() / jnp.maximum(measured.sum(), 1),
     }
-
-
-def _four(model: Any, rgb: Array, depth: Array) -> Array:
-    """Return colour and depth signal in 4 channels."""
-    return jnp.concatenate([rgb, signal_from_depth(model.clip, depth)[..., None]], -1)
 
 
 def _psnr(made: Array, truth: Array, where: Array) -> Array:

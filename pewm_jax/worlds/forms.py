@@ -22,7 +22,7 @@ Form = tuple[Any, tuple[str, ...]]
 """The structure of parameters, and their paths in its order."""
 
 
-def own(model: Task, params: Params) -> Any:
+def in_world_form(model: Task, params: Params) -> Any:
     """Return parameters in the form that the world's ``init``, or a stage's, returns them."""
     for structure, paths in _forms(model):
         leaves = tree.flatten(params)

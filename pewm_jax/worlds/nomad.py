@@ -40,6 +40,8 @@ SMALL = 1e-2
 class NomadTrainConfig(TrainSettings):
     """How the policy is trained: by imitation of recorded walks."""
 
+    ZERO: ClassVar[dict[str, str]] = {"preview_every": "a policy imagines nothing"}
+
     run: str = "runs/nomad"
     """Folder of this run: checkpoints, logs, numbers."""
     preview_every: int = 0
@@ -57,11 +59,6 @@ class NomadTrainConfig(TrainSettings):
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
-        require(
-            self.preview_every == 0,
-            f"train.preview_every is {self.preview_every}: a policy imagines nothing to be shown, "
-            "use 0.",
-        )
         require(
             self.policy.batch >= 2,
             "train.policy.batch is 1: a goal that cannot be reached is taken from another clip of "
@@ -135,8 +132,9 @@ class NomadTask(Task):
         nearer than the farthest; the distance where the goal is not hidden. (The reference averages
         the error of the distance over hidden goals too.)
 
-        Returns: ``(loss, measured)``: ``noise``, the mean squared error, and ``steps_off``, the
-            root mean square error of the distance.
+        Returns:
+            ``(loss, measured)``: ``noise``, the mean squared error, and ``steps_off``, the root
+            mean square error of the distance.
         """
         assert isinstance(train, NomadTrainConfig)
         policy, weights = self.policy, params["policy"]

@@ -105,15 +105,9 @@ def loss(
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of one batch and its parts.
 
-    Args:
-        model: the model.
-        train: settings of noise on the observed frame, chained clips and hidden memories.
-        params: the world model's parameters.
-        clip: a batch, leading axis B, colours uint8 or float.
-        key: randomness of times, noise and image noise.
-        memory: whether the memory is read (in stage 2).
-        history: frames of a clip that are observed.
-        blind: share of clips from which the input of guidance is hidden.
+    ``train`` has the settings of noise on the observed frame, chained clips and hidden memories.
+    The first ``history`` frames of a clip are observed; a share ``blind`` of the clips lacks the
+    input of guidance; ``memory`` is True in stage 2.
 
     Returns:
         ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of the noise's target,
@@ -225,24 +219,15 @@ def first_frames(
 ) -> tuple[Array, Array]:
     """Return the first frames of a batch of clips, a share of them predicted by the model.
 
-    Only the leading clips of a batch, as many as the share asks for, go through the model.
-
-    Args:
-        model: the model; its control must be by cameras, which can be run backwards.
-        share: probability of each clip to be chained, above 0; over the batch it is exact on
-            average, and only the leading clips are ever chosen.
-        params: the world model's parameters.
-        frames: (B, T) the clips' frames, colours in [−1, 1].
-        latents_BthwC: their latents.
-        readout: the memory's readout, leading axis B, or None without memory.
-        key: randomness of choice, level and noise.
+    Only the leading clips of a batch, as many as the share asks for, go through the model: over the
+    batch the share is exact on average, and only these clips are ever chosen.
 
     Returns:
         Colours (B, 1, H, W, 3) in [−1, 1] and depth (B, 1, H, W) in metres; 0 if the denoiser works
         without depth.
 
     Raises:
-        UserError: the control needs actions.
+        UserError: the control needs actions; only cameras can be run backwards.
     """
     if model.control.actions:
         raise UserError(
@@ -259,7 +244,7 @@ def first_frames(
         return jax.tree.map(lambda x: x[:rows], whole)
 
     made = jax.lax.stop_gradient(
-        _looking_back(
+        _predict_backwards(
             model,
             jax.lax.stop_gradient(params),
             leading(frames),
@@ -297,7 +282,7 @@ def backwards(model: AssembledModel, readout: MemoryReadout) -> MemoryReadout:
     return dataclasses.replace(pictures, tokens=readout.tokens)
 
 
-def _looking_back(
+def _predict_backwards(
     model: AssembledModel,
     params: Params,
     frames: Frames,

@@ -71,15 +71,7 @@ def rollout(
 ) -> tuple[WorldState, Frames]:
     """Imagine the frames that actions lead to, and remember them; see ``worlds.imagine``.
 
-    Args:
-        config: the experiment, or its model (static under jit).
-        params: the world model's parameters.
-        state: from ``start`` or from an earlier rollout.
-        actions: n ≥ 1 discrete actions, (n, 3) continuous ones, or cameras; an array or a list.
-        key: randomness of the sampling noise.
-        memory: False ignores the map (the empty-map baseline); it is still updated.
-
-    Returns:
-        ``(state, frames)``: the world after the last frame, and the n imagined frames.
+    Actions are n ≥ 1 discrete actions, (n, 3) continuous ones, or cameras, in an array or a list.
+    With ``memory`` False the map is ignored (the empty-map baseline) but still updated.
     """
     return worlds.imagine(config, params, state, actions, key, memory=memory)

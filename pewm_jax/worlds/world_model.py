@@ -53,14 +53,10 @@ def condition(
 ) -> ClipConditioning:
     """Build the conditioning of a batch of clips.
 
-    Args:
-        model: the model.
-        params: the world model's parameters; codec, image, control and text are used.
-        observed: (B, 1) the first frames, colours float in [−1, 1], depth in metres; or more of
-            them, as many as fill latent frames.
-        control: (B, T) cameras of all frames, and (B, T − 1) actions if there are any.
-        noise_B: deviation of noise that was added to the observed colours; None for none.
-        clean_BTHWC: these colours before that; None where there is no noise.
+    Observed are the (B, 1) first frames, colours in [−1, 1], depth in metres, or as many as fill
+    latent frames; the control has (B, T) cameras, and (B, T − 1) actions if there are any.
+    ``noise_B`` is the deviation of noise that was added to the observed colours, and
+    ``clean_BTHWC`` are the colours before.
     """
     batch, rgb = len(observed.depth_THW), observed.rgb_THWC
     first = rgbd.encode_rgbd(model, params, rgb, observed.depth_THW, condition=True)
@@ -163,18 +159,10 @@ def apply(
     time_B: Array,
     readout: MemoryReadout | None = None,
 ) -> Array:
-    """Predict the noise's target (x0, v, ε, velocity …) from noisy latents.
+    """Predict the noise's target (x0, v, ε, velocity …) from noisy latents, in float32.
 
-    Args:
-        model: the model.
-        params: ``{"backbone": …, "memory": …}``.
-        noisy_BthwC: (B, t, h, w, C) noisy colour and depth latents.
-        conditioning: the observed frame, control and text.
-        time_B: (B,) noise level in the network's units, or (B, t), one for each latent frame.
-        readout: the memory's readout, leading axis B; None is the stage-1 model.
-
-    Returns:
-        (B, t, h, w, C) float32 prediction.
+    ``time_B`` is (B,) in the network's units, or (B, t), one for each latent frame. The readout has
+    a leading axis B; None is the stage-1 model.
     """
     dtype, memory_readers = jnp.dtype(model.dtype), NO_READERS
     if readout is not None and "memory" in params:
@@ -223,21 +211,11 @@ def sample(
 ) -> Array:
     """Sample one batch of clips' latents with the configured noise and sampler.
 
-    With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM
-    lets g vary with the step (``noise.dynamic_guidance``). ``blind`` replaces "no map". Where the
-    conditioning knows latents, x0 is the known value.
-
-    Args:
-        model: the model.
-        params: the world model's parameters.
-        conditioning: observed frame, control, text.
-        readout: the memory's readout, or None for no memory.
-        noise_BthwC: standard normal start.
-        key: randomness of the steps, if the sampler draws noise.
-        blind: the conditioning without the input that guidance strengthens.
-
-    Returns:
-        (B, t, h, w, C) latents.
+    With ``noise.guidance`` g ≠ 1 the prediction is x0(no map) + g·(x0(map) − x0(no map)); DDPM lets
+    g vary with the step (``noise.dynamic_guidance``). ``blind`` is the conditioning without the
+    input that guidance strengthens, and replaces "no map". Where the conditioning knows latents, x0
+    is the known value. Sampling starts from standard normal noise; ``key`` is for samplers that
+    draw more.
 
     Raises:
         ValueError: the sampler draws noise at every step and there is no key.

@@ -9,7 +9,7 @@ import pytest
 
 from pewm_jax.config import ConfigError
 from pewm_jax.diffusion.flow import PERSIST_PIXELS, PERSIST_VOXELS, FlowConfig, FrameFlowConfig
-from pewm_jax.worlds.persist.state import context
+from pewm_jax.worlds.persist.state import noisy_context
 
 PLAIN = FrameFlowConfig(shift=1.0, smallest=0.0)
 
@@ -84,7 +84,7 @@ def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
 def test_given_frames_have_a_little_noise_and_say_so():
     config = PERSIST_PIXELS
     x0 = np.zeros((2, 3, 50, 40), np.float32)
-    x_t, times = context(config, x0, jax.random.key(0))
+    x_t, times = noisy_context(config, x0, jax.random.key(0))
     np.testing.assert_allclose(times, np.full((2, 3), 0.1), rtol=1e-6)
     np.testing.assert_allclose(np.asarray(x_t).std(), 0.1, rtol=0.05)
 

@@ -11,10 +11,11 @@ import pytest
 
 from pewm_jax import worlds
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import ClipConfig, UserError, World
+from pewm_jax.config import AssembledModel, Capabilities, ClipConfig, Config, UserError, World
 from pewm_jax.registry import register
 from pewm_jax.types import Frames, WorldState
 from pewm_jax.worlds.control import control_of
+from pewm_jax.worlds.pewm.world import PEWM
 from tests.helpers import random_frames
 
 CLIP = ClipConfig(height=16, width=16)
@@ -59,6 +60,54 @@ class Still(World):
         if self.wrong == "imagined":
             return frames
         return state, frames.rgb_THWC if self.wrong == "array" else frames
+
+
+class Dictionary(Still):
+    @property
+    def capabilities(self) -> Any:
+        return {"edits": False}
+
+
+class Edits(Still):
+    @property
+    def capabilities(self):
+        return Capabilities(edits=True)
+
+
+class Erases(Edits):
+    def erase(self, params, state, box_23):
+        return state
+
+
+class Points(Still):
+    @property
+    def capabilities(self):
+        return Capabilities(points=True)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (Dictionary, "Dictionary.capabilities is a dict: make it a property that returns"),
+        (Edits, "Edits.capabilities has edits=True, and Edits has no method erase and move: add"),
+        (Erases, "Erases.capabilities has edits=True, and Erases has no method move: add it, or"),
+        (Points, "Points has no method memory_points: add it, or set points=False."),
+    ],
+)
+def test_wrong_capabilities_are_refused_at_the_first_use(kind, message):
+    for use in (lambda: worlds.start(kind(), {}, FRAMES), lambda: Config(model=kind())):
+        with pytest.raises(UserError, match=re.escape(message)):
+            use()
+
+
+def test_an_assembled_world_has_only_the_capabilities_of_its_methods():
+    class Plain(AssembledModel):
+        init = stages = observe = imagine = None  # type: ignore[assignment]
+
+    assert PEWM().capabilities.edits
+    assert PEWM().capabilities.coverage
+    assert not Plain().capabilities.edits
+    assert not Plain().capabilities.coverage
 
 
 def test_what_is_right_passes():

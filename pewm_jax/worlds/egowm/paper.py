@@ -36,19 +36,11 @@ def experiment(
     size: tuple[int, int] = (SIDE, SIDE),
     dtype: Literal["float32", "bfloat16"] = "bfloat16",
 ) -> Config:
-    """Return the settings of the paper on Stable Video Diffusion.
+    """Return the settings of the paper on Stable Video Diffusion, with runs in ``runs/`` + ``run``.
 
-    Size, learning rates, motion bucket, noise on the image, guidance and number of sampling steps
-    are the paper's; steps, batch, noise levels in training (those of Stable Video Diffusion) and
-    the share of clips without the image are ours.
-
-    Args:
-        unet: the network, with its image encoder.
-        vae: its autoencoder.
-        noise: its scheduler.
-        run: name of the experiment, for the folder of its runs.
-        size: height and width of a frame.
-        dtype: precision of the computation.
+    Size (height, width), learning rates, motion bucket, noise on the image, guidance and number of
+    sampling steps are the paper's; steps, batch, noise levels in training (those of Stable Video
+    Diffusion) and the share of clips without the image are ours.
     """
     height, width = size
     return Config(

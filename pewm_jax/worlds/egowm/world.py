@@ -40,6 +40,11 @@ from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 class EgoWMTrainConfig(TrainSettings):
     """How a video model becomes a world model: the whole backbone is trained, with actions."""
 
+    ZERO: ClassVar[dict[str, str]] = {
+        "hidden": "this world has no memory to hide",
+        "chained": "the clips of this world cannot be run backwards",
+    }
+
     run: str = "runs/egowm"
     """Folder of this run: checkpoints, logs, images, report."""
     video: StageConfig = StageConfig(steps=0)
@@ -58,11 +63,6 @@ class EgoWMTrainConfig(TrainSettings):
         """Validate."""
         super().__post_init__()
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
-        require(
-            self.hidden == 0 and self.chained == 0,
-            f"train.hidden is {self.hidden} and train.chained {self.chained}: this world has no "
-            "memory to hide, and its clips cannot be run backwards; use 0 for both.",
-        )
 
 
 @register("world", "egowm")
@@ -210,14 +210,9 @@ class EgoWM(AssembledModel):
     def imagine_chunk(self, params: Params, past: Frames, control: Control, key: Array) -> Frames:
         """Imagine one chunk of n = clip.frames − history frames.
 
-        Args:
-            params: the world model's parameters.
-            past: (history) frames before it, colours float in [−1, 1]; the last one is the present.
-            control: (n) cameras of the frames to imagine, and actions that lead to them.
-            key: randomness of the noise.
-
-        Returns:
-            n frames; depth is 0 where the denoiser works without it (``clip.depth``).
+        ``past`` has the (history) frames before it, of which the last is the present; ``control``
+        has (n) cameras, and actions that lead to them. Depth is 0 where the denoiser works without
+        it.
         """
         before = self.history - 1
         actions = control.actions_TA

@@ -30,6 +30,10 @@ POINT_WAVES = 4
 class PersistTrainConfig(TrainSettings):
     """How the world is trained: one network after the other; the codec of pictures is frozen."""
 
+    ZERO: ClassVar[dict[str, str]] = dict.fromkeys(
+        ("hidden", "chained"), "it is for worlds with memory blocks"
+    )
+
     run: str = "runs/persist"
     """Folder of this run: checkpoints, logs, images, report."""
     fresh: tuple[str, ...] = (r"(voxel_vae|voxel_dit|camera_model|renderer)/.*",)
@@ -67,11 +71,6 @@ class PersistTrainConfig(TrainSettings):
         require(self.classes >= 0, f"train.classes is {self.classes}: use 0 or more.")
         require(self.compared >= 1, f"train.compared is {self.compared}: use 1 or more.")
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
-        require(
-            self.hidden == 0 and self.chained == 0,
-            f"train.hidden is {self.hidden} and train.chained {self.chained}: they are of worlds "
-            "with memory blocks; use 0 for both.",
-        )
 
     def require_fit(self, model: Any) -> None:
         """Refuse classes through a decoder that cannot decode a latent alone."""
@@ -149,6 +148,16 @@ class PersistModel(AssembledModel):
     def capabilities(self) -> Capabilities:
         """What a world of voxels can do; all its stages train with them."""
         return dataclasses.replace(super().capabilities, stage_without_memory=False)
+
+    @property
+    def side(self) -> int:
+        """Cells along an axis of a window."""
+        return self.backbone.voxel_vae.side
+
+    @property
+    def cell(self) -> float:
+        """Side of a cell, metres."""
+        return self.memory.cell_m[0]
 
     @property
     def picture_channels(self) -> int:

@@ -1,9 +1,9 @@
 """The losses of PERSIST's networks, one for each stage (arXiv 2603.03482).
 
-``voxel_vae`` reconstructs grids; ``world_frames`` and ``renderer`` learn the velocity of latents,
+``world_frames`` and ``renderer`` learn the velocity of latents,
 with a time for each frame; ``camera`` learns the steps between cameras. All are functions of arrays
 with a leading axis B. In ``actions_BTA`` row t is the action that leads to frame t, zeros for the
-first; ``led_to`` computes them from recorded ones, which lead away.
+first; ``leading_actions`` computes them from recorded ones, which lead away.
 """
 
 from __future__ import annotations
@@ -37,26 +37,17 @@ Compare = Callable[[Array, Array, Array], tuple[Array, Array]]
 already weighted, and the share that is right; see ``losses.compared``."""
 
 
-def led_to(actions_BTA: Array) -> Array:
+def leading_actions(actions_BTA: Array) -> Array:
     """Turn (B, T − 1, A) actions that lead away from frames into (B, T, A) that lead to them."""
     return jnp.pad(jnp.asarray(actions_BTA), ((0, 0), (1, 0), (0, 0)))
 
 
-def previous(frames: Any) -> Any:
+def previous_frames(frames: Any) -> Any:
     """Return for each frame of (B, T, …) arrays the value of the frame before.
 
     The first frame keeps its own, from which a world can begin (w₀ from o₀).
     """
     return jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x[:, :-1]], 1), frames)
-
-
-def voxel_vae(
-    config: VoxelVAEConfig, params: Params, classes_BTXYZ: Array, key: Array, dtype: Any
-) -> tuple[Array, Measured]:
-    """Return the loss of all grids of a batch of clips; see ``models.persist.voxel_vae.loss``."""
-    grids = jnp.asarray(classes_BTXYZ)
-    grids = grids.reshape(-1, *grids.shape[2:])
-    return voxel_vae_model.loss(config, params, grids, key, dtype)
 
 
 def world_frames(
@@ -77,23 +68,12 @@ def world_frames(
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of voxel frames.
 
-    Unknown latents of a frame are noise at any time; later frames do not read them, and their error
-    does not count.
-
-    Args:
-        config: the network.
-        noise: times and noise.
-        params: the network's parameters.
-        latents_BTxyzC: normalised latents of voxel frames.
-        actions_BTA: the action that leads to each frame.
-        pixels_BThwC: latents of the image at each frame; see ``previous``.
-        key: randomness of times, noise and hidden images.
-        camera_BTN: numbers of the camera at each frame.
-        blind: share of frames after the first that are not conditioned on an image.
-        known_BTxyz: bool, the latents that a world would know at that frame; None for all.
-        weight_BTxyz: weight of each latent's error; None for 1.
-        compare: an error of the predicted x0 that is added; see ``Compare``.
-        dtype: of the computation.
+    ``latents_BTxyzC`` are normalised; ``actions_BTA`` lead to each frame; ``pixels_BThwC`` and
+    ``camera_BTN`` are latents of the image and numbers of the camera at each frame (see
+    ``previous_frames``). A share ``blind`` of the frames after the first is not conditioned on an
+    image. Latents that ``known_BTxyz`` excludes are noise at any time; later frames do not read
+    them, and their error does not count. ``weight_BTxyz`` weights each latent's error; ``compare``
+    adds one of the predicted x0.
     """
     velocity_key, shown_key = jax.random.split(key)
     front = latents_BTxyzC.shape[:2]
@@ -103,8 +83,8 @@ def world_frames(
         config,
         params,
         actions_BTA=actions_BTA,
-        pixels_BThwC=previous(pixels_BThwC),
-        camera_BTN=None if camera_BTN is None else previous(camera_BTN),
+        pixels_BThwC=previous_frames(pixels_BThwC),
+        camera_BTN=None if camera_BTN is None else previous_frames(camera_BTN),
         shown_BT=shown | (jnp.arange(front[1]) == 0) if blind else None,
         known_BTxyz=known_BTxyz,
     )
@@ -132,21 +112,12 @@ def camera(
     reckoned_BT6: Array | None = None,
     dtype: Any = jnp.float32,
 ) -> tuple[Array, Measured]:
-    """Return the mean squared error of the steps between cameras, in ``config.units``.
+    """Return the mean squared error of the steps between (B, T) cameras, in ``config.units``.
 
     The position of a grid tells where the agent has gone. A camera's position is therefore relative
-    to the middle of its own frame's grid, not of the grid that the step leads to.
-
-    Args:
-        config: the network.
-        params: its parameters.
-        classes_BTXYZ: class ids at each frame.
-        middle_BT3: the middle of each frame's grid, metres.
-        cameras: (B, T) cameras.
-        actions_BTA: the action that leads to each frame.
-        width: of the images of the cameras' intrinsics, pixels.
-        reckoned_BT6: steps to each frame, to which the network's output is added; None for none.
-        dtype: of the computation.
+    to the middle of its own frame's grid, ``middle_BT3`` in metres, not of the grid that the step
+    leads to. ``actions_BTA`` and the steps ``reckoned_BT6``, to which the network's output is
+    added, lead to each frame. ``width`` is that of the images, pixels.
 
     Returns:
         ``(loss, {"metres_off", "radians_off"})``: mean lengths of the errors.
@@ -182,16 +153,9 @@ def renderer(
 ) -> tuple[Array, Measured]:
     """Return the squared error of the velocity of the images' latents.
 
-    Args:
-        config: the network.
-        noise: times and noise.
-        params: the network's parameters.
-        latents_BThwC: latents of images.
-        layers: (B, T, h, w, L) hits of their rays, from ``voxel_renderer.cast_rays``.
-        key: randomness of times and noise.
-        actions_BTA: the action that leads to each frame, where the network takes one.
-        drawn_BThwC: latents of the drawn voxels, where the network takes them.
-        dtype: of the computation.
+    ``layers`` are the (B, T, h, w, L) hits of their rays, from ``voxel_renderer.cast_rays``. The
+    actions that lead to each frame and the latents of the drawn voxels are for networks that take
+    them.
     """
     seen = voxel_renderer.features(config, params, layers, dtype, drawn_hwC=drawn_BThwC)
     predict = functools.partial(
@@ -239,7 +203,7 @@ def _velocity(
     return loss + compared, measured | {"classes": compared, "classes_right": right}
 
 
-def compared(
+def class_error(
     config: VoxelVAEConfig,
     params: Params,
     latents_BTxyzC: Array,
@@ -248,16 +212,10 @@ def compared(
     count: int,
     key: Array,
 ) -> tuple[Array, Array]:
-    """Return the cross-entropy of the cells of latents that are drawn by their weight.
+    """Return the cross-entropy of the cells of ``count`` latents per frame, drawn by their weight.
 
-    Args:
-        config: the autoencoder, one that ``PersistTrainConfig.classes`` accepts.
-        params: its parameters.
-        latents_BTxyzC: normalised latents.
-        classes_BTXYZ: int class ids of the cells, below 0 if unknown.
-        weight_BTxyz: weight of each latent; those with 0 are never drawn.
-        count: latents drawn of each frame.
-        key: randomness of the choice.
+    ``config`` is an autoencoder that ``PersistTrainConfig.classes`` accepts; latents are
+    normalised; class ids are below 0 if unknown; latents of weight 0 are never drawn.
 
     Returns:
         ``(error, right)``: () nats per cell, () the share of cells whose class is the likeliest.
@@ -267,7 +225,7 @@ def compared(
     weight = weight_BTxyz.reshape(frames, -1).astype(jnp.float32)
     cells = cells_of_latents(config, classes_BTXYZ.reshape(frames, *classes_BTXYZ.shape[2:]))
     drawn = voxel_vae_model.sample_cells(weight, count, key)[..., None]
-    error, right = error_of(
+    error, right = latent_class_error(
         config,
         params,
         jnp.take_along_axis(flat, drawn, 1).reshape(frames * count, -1),
@@ -284,20 +242,14 @@ def cells_of_latents(config: VoxelVAEConfig, classes_BXYZ: Array) -> Array:
     return patchify(classes_BXYZ[..., None], config.factor, config.factor)
 
 
-def error_of(
+def latent_class_error(
     config: VoxelVAEConfig, params: Params, latents_NC: Array, classes_NK: Array
 ) -> tuple[Array, Array]:
-    """Return the cross-entropy of the cells of latents, each decoded alone.
-
-    Args:
-        config: the autoencoder.
-        params: its parameters.
-        latents_NC: normalised latents.
-        classes_NK: class ids of the cells of each; ids below 0 do not count.
+    """Return the cross-entropy of the cells of normalised latents, each decoded alone.
 
     Returns:
-        ``(error_N, right_N)``: the mean over the known cells of a latent, in nats, and the share of
-        them whose class is the likeliest.
+        ``(error_N, right_N)``: the mean over the known cells of a latent (ids ≥ 0), in nats, and
+        the share of them whose class is the likeliest.
     """
     alone = dataclasses.replace(config, side=config.factor, cube=0, slab=0)
     scores = voxel_vae_model.logits(alone, params, latents_NC[:, None, None, None])

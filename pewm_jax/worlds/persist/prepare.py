@@ -22,37 +22,32 @@ from pewm_jax.types import Array, Camera, Clip, Params
 from pewm_jax.worlds.persist import losses
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist.config import PersistModel
-from pewm_jax.worlds.persist.step import drawn
+from pewm_jax.worlds.persist.step import draw_latents
 
 
 def lattice(model: PersistModel, clip: Clip) -> tuple[Array, Array]:
-    """Return the first cells of the recorded grids, and of the windows of their frames.
+    """Return int32 first cells of the recorded grids, and of the windows of their frames.
 
-    Windows begin at whole tokens of a lattice. A rollout's lattice begins at its first frame; here
-    each clip gets its own, which depends on the cell where it begins.
-
-    Returns:
-        ``(recorded_BT3, start_BT3)``: int32 cells, relative to one corner for all frames of a clip.
-
-    Raises:
-        UserError: see ``require_recorded``.
+    They are relative to one corner for all frames of a clip. Windows begin at whole tokens of a
+    lattice. A rollout's lattice begins at its first frame; here each clip gets its own, which
+    depends on the cell where it begins.
     """
     require_recorded(model, clip)
-    size = grid_state.cell_m(model)
+    size = model.cell
     origin = jnp.asarray(clip.extras["origin_T3"])
     first = jnp.floor(origin[:, :1] / size + 1e-3).astype(jnp.int32)
     recorded = first + jnp.round((origin - origin[:, :1]) / size).astype(jnp.int32)
     place = jnp.asarray(clip.frames.camera.world_from_camera)[..., :3, 3]
     agent = recorded + jnp.floor((place - origin) / size).astype(jnp.int32)
-    wide, token = grid_state.side(model), model.backbone.token_cells
-    shift = _mixed(agent[:, :1]) % token
+    wide, token = model.side, model.backbone.token_cells
+    shift = _hash_cell(agent[:, :1]) % token
     recorded, agent = recorded + shift, agent + shift
-    start = grid_state.snapped(agent - wide // 2, token)
+    start = grid_state.snap(agent - wide // 2, token)
     beside = (model.memory.recorded - wide) // 2
     return recorded, start.at[..., 2].set(recorded[..., 2] + beside)
 
 
-def _mixed(cell_BT3: Array) -> Array:
+def _hash_cell(cell_BT3: Array) -> Array:
     """Return two pseudo-random numbers, which depend on a cell, and 0."""
     x, y, _ = jnp.moveaxis(cell_BT3.astype(jnp.uint32), -1, 0)
     mixed = (x * jnp.uint32(0x9E3779B1)) ^ (y * jnp.uint32(0x85EBCA6B))
@@ -61,10 +56,10 @@ def _mixed(cell_BT3: Array) -> Array:
     return both.astype(jnp.int32)
 
 
-def cut(model: PersistModel, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
+def cut_windows(model: PersistModel, clip: Clip, start_BT3: Array, recorded_BT3: Array) -> Array:
     """Return (B, T, X, Y, Z) int16 windows of the recorded grids; cells outside are unknown."""
     classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
-    one = functools.partial(grid_state.cut, count=grid_state.side(model))
+    one = functools.partial(grid_state.cut_box, count=model.side)
     return jax.vmap(jax.vmap(one))(classes, start_BT3 - recorded_BT3)
 
 
@@ -76,7 +71,7 @@ def pictures(
     latents = rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
     latents = latents[..., : model.picture_channels]
     camera = jax.tree.map(jnp.asarray, frames.camera)
-    return latents, grid_state.shown_of(latents, jnp.asarray(frames.depth_THW), camera)
+    return latents, grid_state.shown_picture(latents, jnp.asarray(frames.depth_THW), camera)
 
 
 def grids(model: PersistModel, params: Params, clip: Clip) -> Clip:
@@ -85,14 +80,16 @@ def grids(model: PersistModel, params: Params, clip: Clip) -> Clip:
     recorded, start = lattice(model, clip)
     ends = jnp.array([0, -1])
     some = clip.with_extras(classes_TXYZ=jnp.asarray(clip.extras["classes_TXYZ"])[:, ends])
-    return _prepared(clip, jnp.maximum(cut(model, some, start[:, ends], recorded[:, ends]), 0))
+    return _prepared(
+        clip, jnp.maximum(cut_windows(model, some, start[:, ends], recorded[:, ends]), 0)
+    )
 
 
 def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
     """Return latents of voxel frames, all in the window of the last one, and their conditioning."""
     recorded, start = lattice(model, clip)
     last = jnp.broadcast_to(start[:, -1:], start.shape)
-    classes = cut(model, clip, last, recorded)
+    classes = cut_windows(model, clip, last, recorded)
     shape = classes.shape[:2]
     flat = classes.reshape(-1, *classes.shape[2:])
     config, weights = model.backbone.voxel_vae, params["voxel_vae"]
@@ -104,15 +101,15 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
     latents = jax.lax.map(encode, flat)
     latents = latents.reshape(*shape, *latents.shape[1:])
     recorded_too = jax.vmap(jax.vmap(functools.partial(grid_state.known_latents, model)))(classes)
-    token, wide = model.backbone.token_cells, grid_state.side(model)
+    token, wide = model.backbone.token_cells, model.side
     at = last[..., None] + jnp.arange(0, wide, token)  # (B, T, 3, tokens)
     inside = (at >= start[..., None]) & (at < start[..., None] + wide)
     x, y, z = jnp.moveaxis(inside, 2, 0)
     own = x[..., :, None, None] & y[..., None, :, None] & z[..., None, None, :]
     patch = model.backbone.world_frames.patch
-    known = grid_state.spread(own, patch) & recorded_too
+    known = grid_state.repeat_tokens(own, patch) & recorded_too
 
-    corner = jnp.asarray(clip.extras["origin_T3"]) - recorded * grid_state.cell_m(model)
+    corner = jnp.asarray(clip.extras["origin_T3"]) - recorded * model.cell
     middle = grid_state.middle(model, corner, last)
     _, shown = pictures(model, params, clip)
     channels = grid_state.picture_channels(model, shown, middle)
@@ -121,7 +118,7 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
         "latents": latents.astype(jnp.float16),
         "told": channels.astype(jnp.float16),
         "camera": camera,
-        "actions": losses.led_to(clip.actions_TA),
+        "actions": losses.leading_actions(clip.actions_TA),
         "known": known,
         "occupied": occupied(model, classes),
         "classes": classes,
@@ -142,19 +139,19 @@ def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
     """Return the voxels around the previous camera of each frame, and the cameras."""
     del params
     recorded, _ = lattice(model, clip)
-    size, config = grid_state.cell_m(model), model.backbone.camera_model
+    size, config = model.cell, model.backbone.camera_model
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     place, origin = camera.world_from_camera[..., :3, 3], jnp.asarray(clip.extras["origin_T3"])
     cell = jnp.floor((place - origin) / size).astype(jnp.int32)
-    before = losses.previous(recorded + cell)
-    one = functools.partial(grid_state.cut, count=config.inner)
+    before = losses.previous_frames(recorded + cell)
+    one = functools.partial(grid_state.cut_box, count=config.inner)
     classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
     inner = jax.vmap(jax.vmap(one))(classes, before - config.inner // 2 - recorded)
     made = {
         "classes": jnp.maximum(inner, 0),
         "middle": origin + cell * size,
         "camera": camera,
-        "actions": losses.led_to(clip.actions_TA),
+        "actions": losses.leading_actions(clip.actions_TA),
     }
     return _prepared(clip, made)
 
@@ -162,8 +159,8 @@ def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
 def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
     """Return latents of the images, and the hits of their rays in the true voxels."""
     recorded, start = lattice(model, clip)
-    classes = jnp.maximum(cut(model, clip, start, recorded), 0)
-    size = grid_state.cell_m(model)
+    classes = jnp.maximum(cut_windows(model, clip, start, recorded), 0)
+    size = model.cell
     corner = jnp.asarray(clip.extras["origin_T3"]) + (start - recorded) * size
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     pixels = (model.clip.height, model.clip.width)
@@ -178,12 +175,12 @@ def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
         "ids": layers.ids_L.astype(jnp.int16),
         "distance": layers.distance_L.astype(jnp.float16),
         "side": layers.side_L.astype(jnp.int8),
-        "actions": losses.led_to(clip.actions_TA),
+        "actions": losses.leading_actions(clip.actions_TA),
     }
     if model.backbone.renderer.drawn:
 
         def draw(one: tuple[Array, Array, Camera]) -> Array:
-            return jax.lax.map(lambda frame: drawn(model, params, *frame), one)
+            return jax.lax.map(lambda frame: draw_latents(model, params, *frame), one)
 
         made["drawn"] = jax.lax.map(draw, (classes, corner, camera)).astype(jnp.float16)
     return _prepared(clip, made)
@@ -194,7 +191,7 @@ def require_recorded(model: PersistModel, clip: Clip) -> None:
     memory, classes = model.memory, clip.extras.get("classes_TXYZ")
     groups = f"--voxels.kinds {memory.kinds} --voxels.colours {memory.colours}"
     command = (
-        f"pewm-jax data collect DATA --moving --voxels --voxels.cell {grid_state.cell_m(model):g} "
+        f"pewm-jax data collect DATA --moving --voxels --voxels.cell {model.cell:g} "
         f"--voxels.side {memory.recorded} {groups} --voxels.pictures {memory.pictures}"
     )
     if classes is None or clip.actions_TA is None:

@@ -16,7 +16,7 @@ from pewm_jax.models.persist import voxel_vae
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.persist import losses, prepare
 from pewm_jax.worlds.persist.config import PersistModel, PersistTrainConfig
-from pewm_jax.worlds.persist.step import reckoning
+from pewm_jax.worlds.persist.step import reckoned_steps
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 Measured = dict[str, Array]
@@ -33,7 +33,7 @@ def init(model: PersistModel, key: Array, networks: int = len(persist_nets.NETWO
     return made | model.backbone.init(key, names)  # type: ignore[call-arg, arg-type]
 
 
-def _of(
+def _prepared(
     prepare: Callable[..., Clip], model: PersistModel, params: Params, clip: Clip
 ) -> dict[str, Any]:
     """Return a stage's inputs, prepared now if they were not before."""
@@ -47,10 +47,10 @@ def autoencode(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``voxel_vae``."""
     del train
-    grids: Any = _of(prepare.grids, model, params, clip)
-    config = model.backbone.voxel_vae
-    dtype = jnp.dtype(model.dtype)
-    return losses.voxel_vae(config, params["voxel_vae"], grids.astype(jnp.int32), key, dtype)
+    grids: Any = _prepared(prepare.grids, model, params, clip)
+    grids = grids.astype(jnp.int32).reshape(-1, *grids.shape[2:])
+    config, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)
+    return voxel_vae.loss(config, params["voxel_vae"], grids, key, dtype)
 
 
 def distribute(
@@ -58,7 +58,7 @@ def distribute(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``voxel_statistics``: least at mean 0 and variance 1 of latents."""
     del train, key
-    grids: Any = _of(prepare.grids, model, params, clip)
+    grids: Any = _prepared(prepare.grids, model, params, clip)
     config, weights = model.backbone.voxel_vae, params["voxel_vae"]
     grids = grids.reshape(-1, *grids.shape[2:]).astype(jnp.int32)
     mean, _ = voxel_vae.moments(config, weights, grids, jnp.dtype(model.dtype))
@@ -76,13 +76,13 @@ def world_frames(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``world_frames``."""
     assert isinstance(train, PersistTrainConfig)
-    made = _of(prepare.frames, model, params, clip)
+    made = _prepared(prepare.frames, model, params, clip)
     config = model.backbone.world_frames
 
     def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
         vae, cells = model.backbone.voxel_vae, made["classes"]
         frozen = params["voxel_vae"]
-        error, right = losses.compared(vae, frozen, x0, cells, weight, train.compared, key)
+        error, right = losses.class_error(vae, frozen, x0, cells, weight, train.compared, key)
         return train.classes * error, right
 
     return losses.world_frames(
@@ -107,7 +107,7 @@ def camera(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``camera``."""
     del train, key
-    made = _of(prepare.cameras, model, params, clip)
+    made = _prepared(prepare.cameras, model, params, clip)
     return losses.camera(
         model.backbone.camera_model,
         params["camera_model"],
@@ -116,7 +116,7 @@ def camera(
         made["camera"],
         made["actions"],
         model.clip.width,
-        reckoned_BT6=reckoning(model, made["actions"]),
+        reckoned_BT6=reckoned_steps(model, made["actions"]),
         dtype=jnp.dtype(model.dtype),
     )
 
@@ -126,7 +126,7 @@ def renderer(
 ) -> tuple[Array, Measured]:
     """Return the loss of stage ``renderer``."""
     del train
-    made = _of(prepare.layers, model, params, clip)
+    made = _prepared(prepare.layers, model, params, clip)
     config = model.backbone.renderer
     layers = RayHits(
         made["ids"].astype(jnp.int32),

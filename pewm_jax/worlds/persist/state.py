@@ -41,45 +41,35 @@ class ShownPicture:
     camera: Camera
 
 
-def cell_m(model: PersistModel) -> float:
-    """Return the side of a cell, metres."""
-    return model.memory.cell_m[0]
-
-
-def side(model: PersistModel) -> int:
-    """Return the cells along an axis of a window."""
-    return model.backbone.voxel_vae.side
-
-
 def first_cell(model: PersistModel, low_3: Array, position_3: Array) -> Array:
     """Return the first cell (3,) of the window around a position, relative to the world's grid.
 
     ``low_3`` is the lowest corner of the grid and ``position_3`` the agent's camera, metres.
     """
-    token, wide = model.backbone.token_cells, side(model)
-    cell = jnp.floor((position_3 - low_3) / cell_m(model)).astype(jnp.int32)
-    start = snapped(cell - wide // 2, token)
+    token, wide = model.backbone.token_cells, model.side
+    cell = jnp.floor((position_3 - low_3) / model.cell).astype(jnp.int32)
+    start = snap(cell - wide // 2, token)
     most = np.asarray(model.memory.cells) - wide
     return jnp.clip(start, 0, most).at[2].set(0)
 
 
-def snapped(cell: Array, token: int) -> Array:
+def snap(cell: Array, token: int) -> Array:
     """Return the nearest whole multiples of a token's cells."""
     return (cell + token // 2) // token * token
 
 
 def window(model: PersistModel, classes_XYZ: Array, start_3: Array) -> Array:
     """Return the cells of a window."""
-    return jax.lax.dynamic_slice(classes_XYZ, tuple(start_3), (side(model),) * 3)
+    return jax.lax.dynamic_slice(classes_XYZ, tuple(start_3), (model.side,) * 3)
 
 
-def written(classes_XYZ: Array, window_XYZ: Array, start_3: Array) -> Array:
+def write_window(classes_XYZ: Array, window_XYZ: Array, start_3: Array) -> Array:
     """Return the world's grid with a window written into it."""
     made = window_XYZ.astype(classes_XYZ.dtype)
     return jax.lax.dynamic_update_slice(classes_XYZ, made, tuple(start_3))
 
 
-def cut(classes_XYZ: Array, start_3: Array, count: int | tuple[int, ...]) -> Array:
+def cut_box(classes_XYZ: Array, start_3: Array, count: int | tuple[int, ...]) -> Array:
     """Return a box of ``count`` cells along each axis; cells outside the grid are unknown."""
     counts = (count,) * 3 if isinstance(count, int) else count
     for axis, (start, length) in enumerate(zip(start_3, counts, strict=True)):
@@ -94,23 +84,25 @@ def cut(classes_XYZ: Array, start_3: Array, count: int | tuple[int, ...]) -> Arr
 
 def known_latents(model: PersistModel, classes_XYZ: Array) -> Array:
     """Return (x, y, z) bool: the latents of tokens whose cells are all known."""
-    token, wide = model.backbone.token_cells, side(model)
+    token, wide = model.backbone.token_cells, model.side
     patch, count = model.backbone.world_frames.patch, wide // token
     known = (classes_XYZ != UNKNOWN).reshape(count, token, count, token, count, token)
-    return spread(known.all((1, 3, 5)), patch)
+    return repeat_tokens(known.all((1, 3, 5)), patch)
 
 
-def spread(known_xyz: Array, patch: int) -> Array:
+def repeat_tokens(known_xyz: Array, patch: int) -> Array:
     """Repeat the values of tokens for all their latents."""
     for axis in (-3, -2, -1):
         known_xyz = jnp.repeat(known_xyz, patch, axis)
     return known_xyz
 
 
-def moved(model: PersistModel, cache: FrameCache, before_3: Array, after_3: Array) -> FrameCache:
+def move_cache(
+    model: PersistModel, cache: FrameCache, before_3: Array, after_3: Array
+) -> FrameCache:
     """Return the cache of voxel frames for a window that has moved; new cells have no entries."""
     token = model.backbone.token_cells
-    count = side(model) // token
+    count = model.side // token
     tokens = (after_3 - before_3) // token
     places = np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)
     source = places + tokens
@@ -126,14 +118,8 @@ def moved(model: PersistModel, cache: FrameCache, before_3: Array, after_3: Arra
     )
 
 
-def shown_of(latents_hwC: Array, depth_HW: Array, camera: Camera) -> ShownPicture:
-    """Return images as conditioning, any leading shape.
-
-    Args:
-        latents_hwC: (..., h, w, C) the images' latents.
-        depth_HW: (..., H, W) their depth, metres, 0 if unknown.
-        camera: (...) their cameras.
-    """
+def shown_picture(latents_hwC: Array, depth_HW: Array, camera: Camera) -> ShownPicture:
+    """Return images, with latents and depth in metres (0 if unknown), as conditioning."""
     rows, columns = latents_hwC.shape[-3:-1]
     height, width = depth_HW.shape[-2:]
     cells = depth_HW.reshape(*depth_HW.shape[:-2], rows, height // rows, columns, width // columns)
@@ -166,7 +152,7 @@ def picture_channels(model: PersistModel, shown: ShownPicture, middle_3: Array) 
 
 def middle(model: PersistModel, low_3: Array, start_3: Array) -> Array:
     """Return the middle (3,) of the window that begins at a cell, metres."""
-    return low_3 + (start_3 + side(model) / 2) * cell_m(model)
+    return low_3 + (start_3 + model.side / 2) * model.cell
 
 
 @jax.tree_util.register_dataclass
@@ -228,13 +214,13 @@ class KnownFrame:
     start_3: Array | None = None
 
 
-def encoded(model: PersistModel, params: Params, rgb_HWC: Array, depth_HW: Array) -> Array:
+def encode_picture(model: PersistModel, params: Params, rgb_HWC: Array, depth_HW: Array) -> Array:
     """Return the latents (h, w, C) of an image, with those of its depth, if it has any."""
     both = rgbd.encode_rgbd(model, params, rgb_HWC[None, None], depth_HW[None, None])
     return both[0, 0, ..., : model.picture_channels]
 
 
-def decoded(model: PersistModel, params: Params, latents_hwC: Array) -> tuple[Array, Array]:
+def decode_picture(model: PersistModel, params: Params, latents_hwC: Array) -> tuple[Array, Array]:
     """Return colours (H, W, 3) and depth (H, W), 0 if unknown, of an image's latents."""
     missing = model.codec.channels - latents_hwC.shape[-1]
     latents = jnp.pad(latents_hwC, ((0, 0), (0, 0), (0, missing)))
@@ -242,7 +228,7 @@ def decoded(model: PersistModel, params: Params, latents_hwC: Array) -> tuple[Ar
     return rgb[0, 0], depth[0, 0] if model.clip.depth else jnp.zeros_like(depth[0, 0])
 
 
-def context(noise: Noise, x0: Array, key: Array) -> tuple[Array, Array]:
+def noisy_context(noise: Noise, x0: Array, key: Array) -> tuple[Array, Array]:
     """Return known frames (1, 1, …) with the noise of ``context_noise``, and their times."""
     times = jnp.full(x0.shape[:2], getattr(noise, "context_noise", 0.0))
     drawn = jax.random.normal(key, x0.shape, x0.dtype)

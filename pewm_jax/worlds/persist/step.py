@@ -23,18 +23,25 @@ from pewm_jax.types import Array, Camera, Frames, Params
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist import voxel_frames
 from pewm_jax.worlds.persist.config import PersistModel
-from pewm_jax.worlds.persist.state import History, KnownFrame, Past, context, decoded, encoded
+from pewm_jax.worlds.persist.state import (
+    History,
+    KnownFrame,
+    Past,
+    decode_picture,
+    encode_picture,
+    noisy_context,
+)
 from pewm_jax.worlds.persist.voxel_frames import ObservedCells
 
 
-def reckoned(model: PersistModel, here: Camera, action_A: Array) -> Camera:
+def reckoned_camera(model: PersistModel, here: Camera, action_A: Array) -> Camera:
     """Return the camera that a planar action leads to; the present camera for other actions."""
     if model.control.actions != 3:
         return here
     return Camera(here.intrinsics_4, step_pose(here.world_from_camera, action_A))
 
 
-def reckoning(model: PersistModel, actions_A: Array) -> Array:
+def reckoned_steps(model: PersistModel, actions_A: Array) -> Array:
     """Return the steps (..., 6) to which the camera model's output is added."""
     if not model.dead_reckoning:
         return jnp.zeros((*actions_A.shape[:-1], CAMERA_STEP_NUMBERS))
@@ -54,9 +61,9 @@ def next_camera(
 ) -> tuple[Camera, FrameCache]:
     """Return the next camera, predicted from the voxels around the present one."""
     config = model.backbone.camera_model
-    place, size = here.world_from_camera[:3, 3], grid_state.cell_m(model)
+    place, size = here.world_from_camera[:3, 3], model.cell
     cell = jnp.floor((place - low_3) / size).astype(jnp.int32)
-    inner = grid_state.cut(classes_XYZ, cell - config.inner // 2, config.inner)
+    inner = grid_state.cut_box(classes_XYZ, cell - config.inner // 2, config.inner)
     seen = camera_numbers(here, model.clip.width, low_3 + cell * size)
     made, cache = camera_model.apply(
         config,
@@ -67,7 +74,7 @@ def next_camera(
         dtype=jnp.dtype(model.dtype),
         cache=cache,
     )  # type: ignore[assignment]
-    change = made[0, 0] + reckoning(model, action_A)
+    change = made[0, 0] + reckoned_steps(model, action_A)
     return follow_camera_steps(here, change, model.clip.width), cache
 
 
@@ -82,25 +89,25 @@ def features(
     """Return the features (1, 1, h, w, F) of a window seen by a camera; rays have no gradient."""
     config = model.backbone.renderer
     camera = jax.lax.stop_gradient(camera)
-    corner = low_3 + start_3 * grid_state.cell_m(model)
+    corner = low_3 + start_3 * model.cell
     layers = voxel_renderer.cast_rays(
         config,
         jnp.maximum(classes_XYZ, 0)[None],
         corner[None],
-        grid_state.cell_m(model),
+        model.cell,
         jax.tree.map(lambda x: x[None], camera),
         (model.clip.height, model.clip.width),
     )
     colours = None
     if config.drawn:
-        colours = drawn(model, params, classes_XYZ, corner, camera)[None]
+        colours = draw_latents(model, params, classes_XYZ, corner, camera)[None]
     dtype = jnp.dtype(model.dtype)
     return voxel_renderer.features(config, params["renderer"], layers, dtype, drawn_hwC=colours)[
         None
     ]
 
 
-def drawn(
+def draw_latents(
     model: PersistModel, params: Params, classes_XYZ: Array, corner_3: Array, camera: Camera
 ) -> Array:
     """Return latents (h, w, C) of a window drawn in the colours of its classes, without light.
@@ -111,7 +118,7 @@ def drawn(
     one = jax.tree.map(lambda x: x[None], camera)
     view = model.memory.render(model, cells, one, model.clip.height, model.clip.width)
     assert view is not None
-    return encoded(model, params, view.features_THWF[0], view.depth_THW[0])
+    return encode_picture(model, params, view.features_THWF[0], view.depth_THW[0])
 
 
 def sample(
@@ -135,7 +142,7 @@ def sample(
     return noise.sample(denoise, jax.random.normal(key, shape))[0, 0]
 
 
-def remembered(
+def add_picture(
     model: PersistModel,
     params: Params,
     latents_hwC: Array,
@@ -145,7 +152,7 @@ def remembered(
     key: Array,
 ) -> FrameCache:
     """Add an image to the renderer's cache."""
-    x, times = context(model.noise, latents_hwC[None, None], key)
+    x, times = noisy_context(model.noise, latents_hwC[None, None], key)
     return _render(model, params, x, times, features, action_A, cache)[1]
 
 
@@ -182,17 +189,11 @@ def begin(
 ) -> Past:
     """Return the world at its first frame (1,); unknown cells of its window are generated.
 
-    Args:
-        model: the model.
-        params: all parameters.
-        grid: the known part of the world.
-        frame: (1,) the first frame, colours in [−1, 1].
-        key: randomness of w₀.
-        real: whether the frame is real, and so is evidence (``model.observation_logit``).
+    A ``real`` frame is evidence of its voxels (``model.observation_logit``).
     """
     camera = jax.tree.map(lambda x: x[0], frame.camera)
-    latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
-    shown = grid_state.shown_of(latents, frame.depth_THW[0], camera)
+    latents = encode_picture(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
+    shown = grid_state.shown_picture(latents, frame.depth_THW[0], camera)
     nets = model.backbone
     dtype = jnp.dtype(model.dtype)
     start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
@@ -209,14 +210,14 @@ def begin(
     middle = grid_state.middle(model, grid.low_3, start)
     evidence = None
     if real:
-        evidence = _sight(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
+        evidence = _evidence(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
     made = voxel_frames.sample(
         model, params, history, history.voxels, middle, before, voxel_key, evidence
     )
     classes = jnp.where(before >= 0, before, made)  # a known grid is not changed by its picture
-    everything = grid_state.written(grid.classes_XYZ, classes, start)
+    everything = grid_state.write_window(grid.classes_XYZ, classes, start)
     seen = features(model, params, classes, grid.low_3, start, camera)
-    pictures = remembered(
+    pictures = add_picture(
         model, params, latents, seen, history.action_A, history.pictures, picture_key
     )
     history = dataclasses.replace(history, pictures=pictures)
@@ -233,35 +234,29 @@ def step(
 ) -> tuple[Past, Frames]:
     """Advance the world by one frame, and return it with the frame, (1,).
 
-    Args:
-        model: the model.
-        params: all parameters.
-        past: the world so far.
-        action_A: the action that leads to the frame.
-        key: randomness.
-        known: the known parts of the frame.
+    ``action_A`` leads to the frame, and ``known`` holds the known parts of it.
     """
     known = KnownFrame() if known is None else known
     grid, history, here = past.grid, past.grid.history, past.shown.camera
     keys = jax.random.split(key, 4)
     camera = known.camera
     if camera is None:
-        camera = reckoned(model, here, action_A)
+        camera = reckoned_camera(model, here, action_A)
     start = known.start_3
     if start is None:
         start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
     middle = grid_state.middle(model, grid.low_3, start)
     before = grid_state.window(model, grid.classes_XYZ, start)
-    cache = grid_state.moved(model, history.voxels, history.start_3, start)
-    cache = voxel_frames.taken_in(model, params, history, cache, middle, before, keys[0])
+    cache = grid_state.move_cache(model, history.voxels, history.start_3, start)
+    cache = voxel_frames.add_present(model, params, history, cache, middle, before, keys[0])
     now = dataclasses.replace(history, action_A=action_A, shown=past.shown)
     classes = known.classes_XYZ
     if classes is None:
         evidence = None
         if known.rgb_HWC is not None and known.depth_HW is not None:
-            evidence = _sight(model, grid, start, known.rgb_HWC, known.depth_HW, camera)
+            evidence = _evidence(model, grid, start, known.rgb_HWC, known.depth_HW, camera)
         classes = voxel_frames.sample(model, params, now, cache, middle, before, keys[1], evidence)
-    everything = grid_state.written(grid.classes_XYZ, classes, start)
+    everything = grid_state.write_window(grid.classes_XYZ, classes, start)
     made, cameras = next_camera(
         model, params, everything, grid.low_3, here, action_A, history.cameras
     )
@@ -269,23 +264,23 @@ def step(
     seen = features(model, params, classes, grid.low_3, start, camera)
     if known.rgb_HWC is None:
         latents = sample(model, params, seen, action_A, history.pictures, keys[2])
-        rgb, depth = decoded(model, params, latents)
+        rgb, depth = decode_picture(model, params, latents)
     else:
         rgb, depth = known.rgb_HWC, known.depth_HW
-        latents = encoded(model, params, rgb, depth)
-    pictures = remembered(model, params, latents, seen, action_A, history.pictures, keys[3])
+        latents = encode_picture(model, params, rgb, depth)
+    pictures = add_picture(model, params, latents, seen, action_A, history.pictures, keys[3])
     history = dataclasses.replace(
         now, voxels=cache, cameras=cameras, pictures=pictures, start_3=start
     )
     after = Past(
         ClassGrid(everything, grid.low_3, history),
-        grid_state.shown_of(latents, depth, camera),
+        grid_state.shown_picture(latents, depth, camera),
     )
     one = jax.tree.map(lambda x: x[None], (rgb, depth, camera))
     return after, Frames(*one)
 
 
-def _sight(
+def _evidence(
     model: PersistModel,
     grid: ClassGrid,
     start_3: Array,
@@ -296,5 +291,5 @@ def _sight(
     """Return the evidence of a real image, if ``model.observation_logit`` uses it."""
     if not model.observation_logit:
         return None
-    corner = grid.low_3 + start_3 * grid_state.cell_m(model)
-    return voxel_frames.seen(model, corner, rgb_HWC, depth_HW, camera)
+    corner = grid.low_3 + start_3 * model.cell
+    return voxel_frames.observe_cells(model, corner, rgb_HWC, depth_HW, camera)

@@ -30,7 +30,7 @@ from pewm_jax.nn.layers import linear
 from pewm_jax.types import Array, Camera, Params
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist.config import PersistModel
-from pewm_jax.worlds.persist.state import History, context
+from pewm_jax.worlds.persist.state import History, noisy_context
 
 
 def sample(
@@ -45,19 +45,13 @@ def sample(
 ) -> Array:
     """Sample a voxel frame: (X, Y, Z) class ids.
 
-    Args:
-        model: the model.
-        params: all parameters.
-        history: gives the action that leads to the frame, and the image that conditions it.
-        cache: of the frames before it.
-        middle_3: the middle of its window, metres.
-        before_XYZ: the window's cells before; ``model.persistence_logit`` applies where they are
-            known.
-        key: randomness.
-        evidence: what a real image of this frame shows of the window's cells.
+    ``history`` gives the action that leads to the frame and the image that conditions it, ``cache``
+    those of the frames before. ``middle_3`` is the middle of the window, metres, and ``before_XYZ``
+    its previous cells, to which ``model.persistence_logit`` applies where they are known.
+    ``evidence`` is that of a real image of this frame.
     """
     config, noise = model.backbone.world_frames, model.voxel_noise
-    asked = _asked(model, history, middle_3)
+    asked = _condition(model, history, middle_3)
     shape = (1, 1, *(config.latent_side,) * 3, config.latent_channels)
 
     def denoise(x: Array, time_B: Array, weight: Array) -> Array:
@@ -102,7 +96,7 @@ def decode_classes(
         scores = scores + model.persistence_logit * (number == before)
         scores = scores + model.empty_prior * ((before == UNKNOWN) & (number == EMPTY))
         if evidence is not None:
-            scores = scores + advantage(model, evidence, config.classes)
+            scores = scores + evidence_logits(model, evidence, config.classes)
         return scores.argmax(-1).astype(jnp.int32)
 
     slab = config.slab or config.side
@@ -111,7 +105,7 @@ def decode_classes(
     return jax.lax.map(likeliest, cut).reshape(before_XYZ.shape)
 
 
-def taken_in(
+def add_present(
     model: PersistModel,
     params: Params,
     history: History,
@@ -127,7 +121,7 @@ def taken_in(
     ids = jnp.maximum(classes_XYZ, 0).astype(jnp.int32)
     latents = voxel_vae.encode(vae, params["voxel_vae"], ids[None], dtype)[:, None]
     noise_key, unknown_key = jax.random.split(key)
-    x, times = context(noise, latents, noise_key)
+    x, times = noisy_context(noise, latents, noise_key)
     x = jnp.where(known[..., None], x, jax.random.normal(unknown_key, x.shape))
     inputs, network_times = noise.precondition(x, times)
     _, cache = voxel_dit.apply(
@@ -135,14 +129,14 @@ def taken_in(
         params["voxel_dit"],
         inputs.astype(dtype),
         network_times,
-        **_asked(model, history, middle_3),
+        **_condition(model, history, middle_3),
         known_BTxyz=known[None, None],
         cache=cache,
     )  # type: ignore[assignment]
     return cache
 
 
-def _asked(model: PersistModel, history: History, middle_3: Array) -> dict[str, Any]:
+def _condition(model: PersistModel, history: History, middle_3: Array) -> dict[str, Any]:
     """Return the transformer's condition of one voxel frame."""
     config, shown = model.backbone.world_frames, history.shown
     channels = grid_state.picture_channels(model, shown, middle_3)
@@ -176,7 +170,7 @@ class ObservedCells:
     colour_XYZ: Array
 
 
-def advantage(model: PersistModel, evidence: ObservedCells, classes: int) -> Array:
+def evidence_logits(model: PersistModel, evidence: ObservedCells, classes: int) -> Array:
     """Return the nats (X, Y, Z, classes) that evidence adds to the scores of classes."""
     number = jnp.arange(classes)
     colours = model.memory.colours
@@ -185,7 +179,7 @@ def advantage(model: PersistModel, evidence: ObservedCells, classes: int) -> Arr
     return model.observation_logit * (air | surface)
 
 
-def seen(
+def observe_cells(
     model: PersistModel, corner_3: Array, rgb_HWC: Array, depth_HW: Array, camera: Camera
 ) -> ObservedCells:
     """Return what an image shows of a window's cells.
@@ -193,7 +187,7 @@ def seen(
     ``corner_3`` is the window's lowest corner, metres; colours are in [−1, 1]; depth is in metres,
     0 without measurement.
     """
-    size, side = grid_state.cell_m(model), grid_state.side(model)
+    size, side = model.cell, model.side
     eye = camera.world_from_camera[:3, 3]
     way_HW3 = unproject(depth_HW, camera) - eye
     metres_HW1 = jnp.linalg.norm(way_HW3, axis=-1, keepdims=True)
@@ -209,18 +203,18 @@ def seen(
     borders = block_light.side_of((way_HW3 + (eye - corner_3)) / size)
     ones = jnp.ones(depth_HW.shape)
     lit = block_light.light(surface, corner_3, size, eye, way_HW3, ones, borders)
-    colour_HW = _nearest(model, (rgb_HWC + 1) / 2 / lit[..., None])
+    colour_HW = _nearest_colour(model, (rgb_HWC + 1) / 2 / lit[..., None])
     colours = model.memory.colours
     votes = jnp.zeros((side**3 + 1, colours), jnp.int32)
     votes = votes.at[cell, colour_HW.reshape(-1)].add(1)[:-1]
     colour = votes.argmax(-1).reshape((side,) * 3).astype(jnp.int32)
-    air = _before(model, corner_3, depth_HW, camera) & ~surface
+    air = _cells_in_front(model, corner_3, depth_HW, camera) & ~surface
     return ObservedCells(air, jnp.where(surface, colour, -1))
 
 
-def _before(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
+def _cells_in_front(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
     """Return the cells (X, Y, Z) in front of the measured depth in their direction."""
-    size, side = grid_state.cell_m(model), grid_state.side(model)
+    size, side = model.cell, model.side
     steps = (np.arange(side) + 0.5) * size
     middle = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).astype(np.float32)
     place = transform_points(invert_rigid(camera.world_from_camera), middle + corner_3)
@@ -234,7 +228,7 @@ def _before(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camer
     return within & (place[..., 2] > NEAREST_M) & (place[..., 2] + size / 2 < measured)
 
 
-def _nearest(model: PersistModel, rgb_HW3: Array) -> Array:
+def _nearest_colour(model: PersistModel, rgb_HW3: Array) -> Array:
     """Return the number of the nearest colour of the palette, (H, W)."""
     count = model.memory.colours
     palette = np.array(list(PALETTE.values())[:count], np.float32) / 255

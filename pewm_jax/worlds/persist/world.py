@@ -29,7 +29,7 @@ from pewm_jax.worlds.control import control_of
 from pewm_jax.worlds.persist import stages as persist_stages
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist.config import PersistModel
-from pewm_jax.worlds.persist.state import KnownFrame, Past, encoded
+from pewm_jax.worlds.persist.state import KnownFrame, Past, encode_picture
 from pewm_jax.worlds.persist.step import begin, step
 from pewm_jax.worlds.stages import Stage
 
@@ -71,13 +71,13 @@ class PERSIST(memories.MemoryEdits, PersistModel):
         them by one step with the real image.
         """
         checks.require_frames(self, frames, "start")
-        return _from_nothing(self, params, frames)
+        return _begin_from_frames(self, params, frames)
 
     def observe(self, params: Params, state: WorldState, frames: Frames) -> WorldState:
         """Observe real frames; see ``worlds.observe``."""
         checks.require_frames(self, frames, "observe")
-        params, frames = _arrays(params, as_signal(frames))
-        return _observed(self, params, past_of(self, params, state), frames)
+        params, frames = _as_arrays(params, as_signal(frames))
+        return _observe(self, params, past_of(self, params, state), frames)
 
     def imagine(
         self,
@@ -94,9 +94,9 @@ class PERSIST(memories.MemoryEdits, PersistModel):
         Without ``memory`` the voxels are generated from the present image, and the state keeps its
         grid.
         """
-        params = _arrays(params)[0]
-        asked, steered = _asked(self, state.frame.camera, control)
-        begun = state if memory else _from_nothing(self, params, state.frame, real=False)
+        params = _as_arrays(params)[0]
+        asked, steered = _steering(self, state.frame.camera, control)
+        begun = state if memory else _begin_from_frames(self, params, state.frame, real=False)
         past = past_of(self, params, begun)
 
         def one(past: Past, inputs: tuple[Array, Camera, Array]) -> tuple[Past, Frames]:
@@ -122,14 +122,8 @@ def start_in(
 ) -> WorldState:
     """Begin a world from a known grid; unknown cells of the first window are generated.
 
-    Args:
-        model: the model.
-        params: all parameters.
-        frames: S ≥ 1 frames in it, as for ``worlds.start``.
-        classes_XYZ: (n, n, n) class ids around the first frame's camera, as episodes have them;
-            −1 where unknown.
-        origin_3: (3,) world position of its lowest corner, metres.
-        depth_scale: as for ``worlds.start``.
+    ``classes_XYZ`` are (n, n, n) class ids around the camera of the first of S ≥ 1 frames, −1 where
+    unknown, and ``origin_3`` the world position of their lowest corner, metres.
 
     Raises:
         UserError: as for ``worlds.start``, or the shape of the grid is another.
@@ -154,34 +148,30 @@ def _start_in(
             f"start_in() got cells of shape {jnp.shape(classes_XYZ)} from {jnp.shape(origin_3)}: "
             "give (n, n, n) class ids and the (3,) lowest corner in metres."
         )
-    params, frames = _arrays(params, as_signal(frames))
+    params, frames = _as_arrays(params, as_signal(frames))
     empty = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
-    size, origin = grid_state.cell_m(model), jnp.asarray(origin_3, jnp.float32)
+    size, origin = model.cell, jnp.asarray(origin_3, jnp.float32)
     # The world's cells are laid where the given ones are, and their heights where those are.
     off = jnp.round((empty.low_3 - origin) / size)
     low = origin + off * size
     given = jnp.asarray(classes_XYZ).astype(jnp.int16)
     shape = empty.classes_XYZ.shape
-    given = grid_state.cut(given, off.astype(jnp.int32), shape)  # unknown where it does not reach
+    given = grid_state.cut_box(given, off.astype(jnp.int32), shape)
     cells = jnp.where(given >= 0, given, empty.classes_XYZ)
-    return _started(model, params, ClassGrid(cells, low), frames)
+    return _begin(model, params, ClassGrid(cells, low), frames)
 
 
 def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -> WorldState:
     """Change the voxels of a world; the next frames show the change.
 
-    ::
+    ``change`` is a function of ``memory.class_grid``; its arguments are the grid's settings and
+    those after the grid::
 
         state = edit(state, class_grid.place, model.memory, box_23, number)
         state = edit(state, class_grid.erase, model.memory, box_23)
         state = edit(state, class_grid.move, model.memory, box_23, transform)
         piece = class_grid.copy(model.memory, state.map, box_23)
         state = edit(state, class_grid.paste, model.memory, piece, transform)
-
-    Args:
-        state: the world.
-        change: a function of ``memory.class_grid``.
-        arguments: the grid's settings, and the function's arguments after the grid.
     """
     config, *rest = arguments
     changed = change(config, state.map, *rest)
@@ -200,25 +190,19 @@ def render_true(
 ) -> tuple[WorldState, Frames]:
     """Render given voxels: the upper bound of the renderer's quality.
 
-    Args:
-        model: the model.
-        params: all parameters.
-        state: from ``start_in``, with the same lattice of cells as the recorded grids.
-        control: cameras of the n frames, or a ``Control`` with actions.
-        classes_TXYZ: (n, R, R, R) recorded grids around them.
-        origin_T3: (n, 3) their lowest corners, metres.
-        key: randomness.
+    The state is from ``start_in``, with the same lattice of cells as the (n, R, R, R) recorded
+    grids, whose lowest corners are ``origin_T3``, metres. The control has n cameras.
     """
-    params = _arrays(params)[0]
-    asked, _ = _asked(model, state.frame.camera, control)
+    params = _as_arrays(params)[0]
+    asked, _ = _steering(model, state.frame.camera, control)
     past = past_of(model, params, state)
-    size, low = grid_state.cell_m(model), state.map.low_3
+    size, low = model.cell, state.map.low_3
 
     def one(past: Past, inputs: Any) -> tuple[Past, Frames]:
         action, camera, classes, origin, frame_key = inputs
         first = grid_state.first_cell(model, low, camera.world_from_camera[:3, 3])
         recorded = jnp.round((origin - low) / size).astype(jnp.int32)
-        grid = grid_state.cut(classes.astype(jnp.int16), first - recorded, grid_state.side(model))
+        grid = grid_state.cut_box(classes.astype(jnp.int16), first - recorded, model.side)
         known = KnownFrame(camera=camera, classes_XYZ=grid, start_3=first)
         return step(model, params, past, action, frame_key, known)
 
@@ -232,26 +216,26 @@ def render_true(
 def past_of(model: PersistModel, params: Params, state: WorldState) -> Past:
     """Return the input of a step from a state."""
     frame = state.frame
-    latents = encoded(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
+    latents = encode_picture(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
     camera = jax.tree.map(lambda x: x[0], frame.camera)
-    return Past(state.map, grid_state.shown_of(latents, frame.depth_THW[0], camera))
+    return Past(state.map, grid_state.shown_picture(latents, frame.depth_THW[0], camera))
 
 
-def _arrays(*trees: Any) -> Any:
+def _as_arrays(*trees: Any) -> Any:
     """Return trees of JAX arrays: loaded weights are NumPy's, which traced indices cannot index."""
     return jax.tree.map(jnp.asarray, trees)
 
 
-def _from_nothing(
+def _begin_from_frames(
     model: PersistModel, params: Params, frames: Frames, *, real: bool = True
 ) -> WorldState:
     """Return a world of which only frames are known."""
-    params, frames = _arrays(params, as_signal(frames))
+    params, frames = _as_arrays(params, as_signal(frames))
     grid = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
-    return _started(model, params, grid, frames, real=real)
+    return _begin(model, params, grid, frames, real=real)
 
 
-def _started(
+def _begin(
     model: PersistModel, params: Params, grid: ClassGrid, frames: Frames, *, real: bool = True
 ) -> WorldState:
     first, later = (jax.tree.map(lambda x, c=c: x[c], frames) for c in (slice(1), slice(1, None)))
@@ -259,15 +243,15 @@ def _started(
     past = begin(model, params, grid, first, key, real=real)
     if not later.depth_THW.shape[0]:
         return WorldState(first, past.grid)
-    return _observed(model, params, past, later)
+    return _observe(model, params, past, later)
 
 
-def _observed(model: PersistModel, params: Params, past: Past, frames: Frames) -> WorldState:
+def _observe(model: PersistModel, params: Params, past: Past, frames: Frames) -> WorldState:
     """Advance the voxels along real frames."""
     count = frames.depth_THW.shape[0]
     here = past.shown.camera.world_from_camera[None]
     poses = jnp.concatenate([here, frames.camera.world_from_camera])
-    actions = _between(model, poses)
+    actions = _actions_between(model, poses)
     keys = jax.random.split(jax.random.fold_in(jax.random.key(START), 1), count)
 
     def one(past: Past, inputs: tuple[Frames, Array, Array]) -> tuple[Past, None]:
@@ -279,14 +263,14 @@ def _observed(model: PersistModel, params: Params, past: Past, frames: Frames) -
     return WorldState(jax.tree.map(lambda x: x[-1:], frames), past.grid)
 
 
-def _between(model: PersistModel, poses: Array) -> Array:
+def _actions_between(model: PersistModel, poses: Array) -> Array:
     """Return the actions between cameras; zeros where they are not planar and so unknown."""
     if model.control.actions == action_geometry.PLANAR:
         return action_geometry.actions_between(poses)
     return jnp.zeros((len(poses) - 1, model.control.actions))
 
 
-def _asked(model: PersistModel, present: Camera, control: Any) -> tuple[Control, bool]:
+def _steering(model: PersistModel, present: Camera, control: Any) -> tuple[Control, bool]:
     """Return cameras and actions of the frames to imagine, and whether only actions steer."""
     planar = model.control.actions == action_geometry.PLANAR
     if isinstance(control, Camera) and planar:

@@ -32,12 +32,9 @@ from pewm_jax.worlds.control import control_of
 
 
 def clip_control(asked: Control, here: slice, length: int) -> Control:
-    """Return the control of one clip of every candidate.
+    """Return the control of one clip of every candidate, the frames ``here`` of (K, n).
 
-    Args:
-        asked: (K, n) cameras and actions of all frames to imagine.
-        here: the clip's frames among them.
-        length: frames that a clip imagines; where fewer were asked for, the agent stands still.
+    If it has less than ``length`` frames, the agent then stands still.
     """
     chunk = Control(jax.tree.map(lambda x: _filled(x[:, here], length), asked.camera))
     if asked.actions_TA is None:
@@ -67,18 +64,11 @@ def imagine_clip(
     memory: bool,
     view: View | None = None,
 ) -> Frames:
-    """Imagine one clip of every candidate: (K, n) frames.
+    """Imagine one clip of every candidate: (K, n) frames, ``shown`` of its T − 1.
 
-    Args:
-        model: the model.
-        params: the world model's parameters.
-        present: the present frame, and whether all share it; else it has a leading axis K.
-        remembered: the memory.
-        control: (K, T − 1) cameras of the frames to imagine, and actions that lead to them.
-        keys: (K,) sampling noise.
-        shown: which of the T − 1 frames are returned.
-        memory: False ignores the memory.
-        view: (K, T) the rendered memory, if it is known.
+    ``present`` is the present frame and whether all share it; else it has a leading axis K. The
+    control has (K, T − 1) cameras, and actions that lead to them; ``view`` is the (K, T) rendered
+    memory, if it is known.
     """
     frame, shared = present
     count = len(keys)
@@ -94,7 +84,7 @@ def imagine_clip(
     whole = dataclasses.replace(control, camera=camera)
     conditioning = jax.vmap(condition, (None if shared else 0, 0))(frame, whole)
     reads = memory and "memory" in params
-    readout = look(model, remembered, camera, params, view) if reads else None
+    readout = read_memory(model, remembered, camera, params, view) if reads else None
     batched = jax.tree.map(lambda x: x[:, None], readout)
     draw = functools.partial(world_model.draw, model, params)
     latents = jax.vmap(draw)(conditioning, batched, keys)[:, 0]
@@ -111,7 +101,7 @@ def imagine_clip(
     return Frames(rgb, depth, jax.tree.map(lambda x: x[:, shown], control.camera))
 
 
-def look(
+def read_memory(
     model: AssembledModel, remembered: Any, camera: Camera, params: Params, view: View | None = None
 ) -> MemoryReadout:
     """Return the readout of K clips, leading axis K; ``view`` (K, T) is the rendering, if known."""

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
-from pewm_jax.codecs.signals import as_signal, signal_from_depth
+from pewm_jax.codecs.signals import as_signal, rgbd_signal
 from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Clip, Control, Params
@@ -66,8 +66,7 @@ def loss(
     view = clip.extras["readout"].view
     assert view is not None
     rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
-    far = signal_from_depth(model.clip, view.depth_THW)[..., None]
-    shown = jnp.concatenate([view.features_THWF[..., :3], far], -1)
+    shown = rgbd_signal(model.clip, view.features_THWF[..., :3], view.depth_THW)
     truth = jax.tree.map(lambda x: x[:, 1:], as_signal(clip.frames))
     return codec_task.score(
         model,

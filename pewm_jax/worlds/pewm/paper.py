@@ -46,16 +46,8 @@ def experiment(
     to the clip's first camera. Not in the paper, and chosen here: 512 cells per clip, 16 frames of
     context, the size of a memory block (see ``READER``), 256 clips per step; weights split over 8
     devices, a node of GPUs, and copied beyond. Adam's decays are those of CogVideoX's own
-    fine-tuning (0.9 and 0.95, ε 1e-8; CogVideo's ``sat/configs/sft.yaml``).
-
-    Args:
-        backbone: the video model's transformer.
-        codec: its autoencoder.
-        noise: its schedule and sampler.
-        run: name of the experiment, for the folder of its runs.
-        clip: the shape of a clip.
-        encoder: the image features that the map keeps, by default the colours of patches.
-        dtype: compute precision.
+    fine-tuning (0.9 and 0.95, ε 1e-8; CogVideo's ``sat/configs/sft.yaml``). The map keeps the
+    features of ``encoder``, by default the colours of patches; runs are in ``runs/`` + ``run``.
     """
     return Config(
         model=PEWM(

@@ -143,14 +143,9 @@ class PEWM(memories.MemoryEdits, AssembledModel):
     ) -> tuple[WorldState, Frames]:
         """Imagine one clip: the T − 1 frames after the present one.
 
-        Args: params: the world model's parameters. state: the world so far. control: (T − 1)
-            cameras of the frames to imagine, and actions that lead to them. key: sampling noise.
-            remember: see ``worlds.imagine``. memory: False ignores the memory. valid_T: (T − 1,)
-            bool, True for the leading frames that were asked for; None if all were.
-
-        Returns:
-            The next state and T − 1 frames, colours float in [−1, 1]. If the denoiser works without
-            depth (``clip.depth``), depth is 0 everywhere, and memories ignore these frames.
+        ``valid_T`` is True for the leading frames that were asked for; None if all were. If the
+        denoiser works without depth (``clip.depth``), depth is 0 everywhere, and memories ignore
+        these frames.
         """
         present, future = state.frame, control.camera
         camera = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), present.camera, future)

@@ -36,7 +36,7 @@ def test_a_latent_decoded_alone_says_what_it_says_in_its_grid(params):
         for x in (missed * known, known)
     )
     ids = persist_classes.cells_of_latents(VAE, classes).reshape(-1, 8)
-    error, right = jax.jit(persist_classes.error_of, static_argnums=0)(
+    error, right = jax.jit(persist_classes.latent_class_error, static_argnums=0)(
         VAE, params, latents.reshape(-1, 4), ids
     )
     np.testing.assert_allclose(error, missed.sum(1) / np.maximum(known.sum(1), 1), rtol=1e-4)
@@ -44,7 +44,7 @@ def test_a_latent_decoded_alone_says_what_it_says_in_its_grid(params):
     decoded = voxel_vae.decode(VAE, params, latents)
     ids = persist_classes.cells_of_latents(VAE, decoded).reshape(-1, 8)
     np.testing.assert_array_equal(
-        persist_classes.error_of(VAE, params, latents.reshape(-1, 4), ids)[1], 1
+        persist_classes.latent_class_error(VAE, params, latents.reshape(-1, 4), ids)[1], 1
     )
 
 
@@ -58,7 +58,9 @@ def test_latents_count_by_their_weight_and_frames_without_any_not_at_all(params)
 
     @jax.jit
     def compared(latents, weight):
-        return persist_classes.compared(VAE, params, latents, some, weight, 50, jax.random.key(0))
+        return persist_classes.class_error(
+            VAE, params, latents, some, weight, 50, jax.random.key(0)
+        )
 
     assert compared(latents, here)[1] > 0.999  # the second frame counts nothing
     assert compared(latents, 1 - here)[1] < 0.5

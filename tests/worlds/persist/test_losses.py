@@ -1,5 +1,7 @@
 """The losses of PERSIST's networks: what they ask for, of which frame, in which units."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,7 @@ from pewm_jax.models.persist.config import (
 )
 from pewm_jax.types import Camera
 from pewm_jax.worlds.persist import losses as persist_losses
+from pewm_jax.worlds.persist import stages
 from tests.models.persist.networks import normal, weights
 
 BLOCKS = BlocksConfig(layers=1, heads=2, head_dim=8, mlp_ratio=2, context=3)
@@ -37,9 +40,9 @@ def walk(seed, frames=4):
 
 def test_actions_lead_to_their_frame_and_pictures_are_those_before():
     recorded = np.arange(1, 7, dtype=np.float32).reshape(1, 3, 2)
-    led = persist_losses.led_to(recorded)
+    led = persist_losses.leading_actions(recorded)
     np.testing.assert_array_equal(led[0], [[0, 0], [1, 2], [3, 4], [5, 6]])
-    shown = persist_losses.previous({"a": np.arange(4)[None]})
+    shown = persist_losses.previous_frames({"a": np.arange(4)[None]})
     np.testing.assert_array_equal(shown["a"][0], [0, 0, 1, 2])
 
 
@@ -174,6 +177,8 @@ def test_every_grid_of_a_clip_is_reconstructed(monkeypatch):
     config = VoxelVAEConfig(side=4, classes=3, patch=4, embed=2, widths=(4,))
     seen = []
     monkeypatch.setattr(voxel_vae, "loss", lambda *arguments: seen.append(arguments))
-    persist_losses.voxel_vae(config, {}, np.zeros((2, 3, 4, 4, 4), int), None, jnp.float32)
+    prepared = {"prepared": np.zeros((2, 3, 4, 4, 4), np.int16)}
+    model = SimpleNamespace(backbone=SimpleNamespace(voxel_vae=config), dtype="float32")
+    stages.autoencode(model, None, {"voxel_vae": {}}, SimpleNamespace(extras=prepared), None)
     ((_, _, grids, _, _),) = seen
     assert grids.shape == (6, 4, 4, 4)

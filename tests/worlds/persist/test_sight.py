@@ -46,7 +46,7 @@ def furnished():
 @pytest.mark.slow
 def test_a_picture_tells_air_from_surfaces_and_their_colours():
     grid, rgb, depth, camera = furnished()
-    evidence = persist_sight.seen(ROOM, LOW, rgb, depth, camera)
+    evidence = persist_sight.observe_cells(ROOM, LOW, rgb, depth, camera)
     air, colour = np.asarray(evidence.air_XYZ), np.asarray(evidence.colour_XYZ)
     assert air.sum() > 30
     assert not grid[air].any()
@@ -64,7 +64,7 @@ def test_a_picture_tells_air_from_surfaces_and_their_colours():
 @pytest.mark.slow
 def test_where_nothing_was_measured_nothing_is_said():
     _, rgb, depth, camera = furnished()
-    evidence = persist_sight.seen(ROOM, LOW, rgb, 0 * depth, camera)
+    evidence = persist_sight.observe_cells(ROOM, LOW, rgb, 0 * depth, camera)
     assert not np.asarray(evidence.air_XYZ).any()
     assert (np.asarray(evidence.colour_XYZ) == -1).all()
 
@@ -98,7 +98,7 @@ def test_a_world_begins_on_the_lattice_of_recorded_cells_and_with_what_it_sees()
     corner = state.map.low_3 + first * 0.5
     camera = jax.tree.map(lambda x: jnp.asarray(x[0]), frames.camera)
     rgb = frames.rgb_THWC[0].astype(np.float32) / 127.5 - 1
-    evidence = persist_sight.seen(MODEL, corner, rgb, frames.depth_THW[0], camera)
+    evidence = persist_sight.observe_cells(MODEL, corner, rgb, frames.depth_THW[0], camera)
     cells = np.asarray(windows.window(MODEL, state.map.classes_XYZ, first))
     assert np.asarray(evidence.air_XYZ).any()
     assert (np.asarray(evidence.colour_XYZ) >= 0).any()
@@ -134,6 +134,6 @@ def test_what_is_seen_decides_between_classes_and_nothing_else_changes():
     np.testing.assert_array_equal(
         persist_voxels.decode_classes(blind, params, latents, before, evidence), made
     )
-    given = persist_sight.advantage(ROOM, evidence, classes)
+    given = persist_sight.evidence_logits(ROOM, evidence, classes)
     assert given.shape == (8, 8, 8, classes)
     assert float(given.max()) == ROOM.observation_logit

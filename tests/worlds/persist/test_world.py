@@ -27,7 +27,7 @@ from pewm_jax.worlds.persist import step as persist_pictures
 from pewm_jax.worlds.persist import voxel_frames as persist_voxels
 from pewm_jax.worlds.persist import world as persist
 from pewm_jax.worlds.persist.config import PersistTrainConfig
-from pewm_jax.worlds.persist.state import encoded
+from pewm_jax.worlds.persist.state import encode_picture
 from tests.helpers import random_frames
 from tests.worlds.persist.tiny_persist import MODEL, NOISE
 
@@ -259,7 +259,7 @@ def test_windows_move_by_tokens_and_what_leaves_is_kept(params, walked, state):
     shape = (1, 1, 2, 64, 1, 1)
     tokens = jnp.arange(128.0).reshape(shape) + 1
     cache = frame_blocks.FrameCache(tokens, tokens, jnp.ones((1, 2, 64), bool), jnp.int32(2))
-    turned = windows.moved(MODEL, cache, jnp.array([2, 0, 0]), jnp.array([4, 0, 0]))
+    turned = windows.move_cache(MODEL, cache, jnp.array([2, 0, 0]), jnp.array([4, 0, 0]))
     grid, new = (x.reshape(2, 4, 4, 4) for x in (tokens, turned.keys_LBSNKd))
     np.testing.assert_array_equal(new[:, :3], grid[:, 1:])
     known = np.asarray(turned.known_BSN).reshape(2, 4, 4, 4)
@@ -380,7 +380,7 @@ def test_windows_of_recorded_grids_are_those_of_a_rollout():
     places = np.arange(12**3).reshape(12, 12, 12)
     clip = clip.with_extras(classes_TXYZ=np.broadcast_to(places, (1, 3, 12, 12, 12)))
     found, start = persist_prepare.lattice(MODEL, clip)
-    grids = persist_prepare.cut(MODEL, clip, start, found)
+    grids = persist_prepare.cut_windows(MODEL, clip, start, found)
     for frame in range(3):
         x, y, z = np.asarray(start - found)[0, frame]
         np.testing.assert_array_equal(
@@ -409,11 +409,11 @@ def test_the_renderer_is_given_the_voxels_drawn_in_their_colours(params):
     cells[6] = class_grid.number_of(MODEL.memory, "furniture")
     camera = jax.tree.map(lambda x: jnp.asarray(x[0]), seen().camera)
     corner = np.asarray(camera.world_from_camera[:3, 3]) - 2.0
-    made = persist_pictures.drawn(MODEL, params, cells, corner, camera)
+    made = persist_pictures.draw_latents(MODEL, params, cells, corner, camera)
     view = MODEL.memory.render(MODEL, class_grid.ClassGrid(cells, corner), seen().camera, 16, 16)
-    wanted = encoded(MODEL, params, view.features_THWF[0], view.depth_THW[0])
+    wanted = encode_picture(MODEL, params, view.features_THWF[0], view.depth_THW[0])
     np.testing.assert_allclose(made, wanted, atol=1e-6)
-    empty = persist_pictures.drawn(MODEL, params, 0 * cells, corner, camera)
+    empty = persist_pictures.draw_latents(MODEL, params, 0 * cells, corner, camera)
     assert np.abs(made - empty).max() > 1e-3
     told = persist_pictures.features(MODEL, params, cells, corner, jnp.zeros(3, jnp.int32), camera)
     np.testing.assert_allclose(told[0, 0, ..., -64:], made, atol=1e-6)
@@ -421,7 +421,7 @@ def test_the_renderer_is_given_the_voxels_drawn_in_their_colours(params):
 
 def test_clips_that_begin_elsewhere_lie_on_other_lattices():
     cells = np.stack(np.meshgrid(*[np.arange(-16, 16)] * 2, [3], indexing="ij"), -1).reshape(-1, 3)
-    mixed = np.asarray(persist_prepare._mixed(jnp.asarray(cells)))
+    mixed = np.asarray(persist_prepare._hash_cell(jnp.asarray(cells)))
     assert not mixed[:, 2].any()
     for axis in (0, 1):
         shares = np.bincount(mixed[:, axis] % 8, minlength=8) / len(cells)
