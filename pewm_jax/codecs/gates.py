@@ -25,7 +25,7 @@ from pewm_jax.types import Array, Params
 
 BLOCKS = 3
 FOLD = 2
-"""Pixels along each axis that are folded into the channels."""
+"""Pixels along each axis that are moved into the channels."""
 IN_CHANNELS = 13
 """Input channels per pixel: colour 3 and depth 1 of decoded, rendered and difference, and seen."""
 OUT_CHANNELS = 6

@@ -29,10 +29,10 @@ from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.types import Array, Params
 
 PATCH = 4
-"""Pixels, each way, that are brought into the channels at first."""
+"""Pixels, along each axis, that are first moved into the channels."""
 COLOURS = 3
 GATE = 65535
-"""Folded into the key of the gate's parameters."""
+"""Number that is folded into the key of the gate's parameters."""
 
 
 _STATISTICS = ("latent_mean_C", "latent_scale_C")
@@ -52,7 +52,7 @@ class LearnedCodecConfig(Codec):
         (r"codec/.*/bias", P()),
         (r"codec/latent_(mean|scale)_C", P()),
     )
-    """Gathered when it computes, each device its own frames."""
+    """Weights are gathered for computation; each device has its own frames."""
     DEPTH_AS_GREY: ClassVar[bool] = True
     CONVERTED: ClassVar[bool] = True
     WEIGHTS_FROM: ClassVar[str] = "train it (pewm-jax train codec)"
@@ -71,8 +71,8 @@ class LearnedCodecConfig(Codec):
     coarse_blocks: int = 4
     """Residual blocks at an eighth of the resolution, in the encoder and as many in the decoder."""
     gate: int = 0
-    """Channels of the gate, which mixes decoded frames with the rendered memory (48, say); 0 for no
-    gate."""
+    """Channels of the gate, which blends decoded frames with the rendered memory (such as 48); 0
+    for no gate."""
 
     @property
     def rgb_channels(self) -> int:

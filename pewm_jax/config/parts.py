@@ -395,7 +395,7 @@ class Memory(Settings):
     Attributes:
         KEEPS_FEATURES: whether it keeps features of the image encoder; else the first three
             features of a point are its colour.
-        REMEMBERS: whether it ever holds anything.
+        REMEMBERS: whether it can hold anything.
         READ_BY_BLOCKS: whether trained memory blocks read it; else it is the state of its world.
         CLASSES: whether it holds class ids of recorded voxels (``kinds``, ``colours``,
             ``pictures``).
@@ -422,17 +422,17 @@ class Memory(Settings):
     tokens: int = 512
     """Map tokens that condition one clip."""
     choose: Literal["visible", "nearest"] = "visible"
-    """Which tokens come first: those that the clip's cameras can see, each frame and each part of
-    its image in turn, hidden ones later; or the nearest in view, hidden or not."""
+    """Order of tokens: those visible from the clip's cameras first, each frame and each part of its
+    image in turn, occluded ones later; or the nearest in view, occluded or not."""
     imagined_far: float = 0.95
-    """Imagined surfaces beyond this share of `clip.far_m` are not remembered."""
+    """Imagined surfaces beyond this share of `clip.far_m` are not inserted."""
     imagined_edge: float = 0.2
-    """Imagined pixels whose depth differs by more than this share from that of a pixel beside them
-    are not remembered: they lie on the edge of something. 0 remembers them."""
+    """Imagined pixels whose depth differs by more than this share from that of a neighbouring pixel
+    are not inserted: they lie on an edge. 0 inserts them."""
     encoder: Encoder = part("encoder", "patch_colours")
-    """The image features that are kept."""
+    """The image encoder, whose features are kept."""
     reader: Reader = part("reader", "attend")
-    """How the denoiser reads them."""
+    """The reader: how the denoiser reads the memory."""
 
     @property
     def extent_m(self) -> float:
@@ -544,7 +544,7 @@ class Memory(Settings):
         if model.backbone.places is None:
             require(
                 not self.REMEMBERS,
-                "this backbone has no place where a memory could be read: use memory.kind none, or "
+                "this backbone has no injection point for a memory: use memory.kind none, or "
                 "another backbone.",
             )
             return
@@ -567,13 +567,13 @@ class Memory(Settings):
         )
         require(
             self.imagined_far > 0,
-            f"memory.imagined_far is {self.imagined_far}: nothing imagined would be remembered; "
+            f"memory.imagined_far is {self.imagined_far}: nothing imagined would be inserted; "
             "use a share of clip.far_m above 0, such as 0.95.",
         )
         require(
             self.imagined_edge >= 0,
             f"memory.imagined_edge is {self.imagined_edge}: use a share such as 0.2, or 0 to "
-            "remember edges.",
+            "insert edges.",
         )
         require(
             self.tokens <= self.capacity,

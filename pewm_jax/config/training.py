@@ -66,12 +66,12 @@ class DataConfig:
     """Folder of cached image features of `data.path`, made by `pewm-jax memory cache`; if
     empty, they are computed at every step."""
     prepared: int = 0
-    """Clips that are encoded, and their memories built and shown, once before the first step, kept
-    in main memory, and drawn again and again; 0 does this at every step, each time with new clips.
-    A CPU needs longer for that than for the step itself."""
+    """Clips that are encoded, and their memories built and read, once before the first step. They
+    stay in main memory and are drawn repeatedly. 0 encodes new clips at every step, which takes
+    longer than the step itself on a CPU."""
     prepared_path: str = ""
-    """Folder that keeps prepared clips on disk (about 1 MB each at 64 × 64), for this run when it
-    is resumed and for others that prepare the same; empty: in main memory alone."""
+    """Folder that keeps prepared clips on disk (about 1 MB each at 64 × 64), for resuming this run
+    and for other runs with the same clips; empty: only in main memory."""
     workers: int = 0
     """Threads that read and decode data ahead of training; 0 means one."""
     bad_records: int = 0
@@ -103,7 +103,7 @@ class StageConfig:
     warmup: int = 50
     """Steps of linear warm-up."""
     decay: Literal["constant", "cosine"] = "cosine"
-    """What the learning rate does after the warm-up."""
+    """Schedule of the learning rate after the warm-up."""
     optimizer: Literal["", "adam", "muon"] = ""
     """Optimizer of this stage; empty for that of all stages, ``train.optimizer``."""
 
@@ -170,16 +170,16 @@ class TrainSettings:
     image_noise_std: float = 0.5
     """Standard deviation of log σ of the noise added to the observed first frame."""
     depth_noise: float = 0.0
-    """Size of the noise on the observed first frame's depth, as a share of the depth; the size of
-    each clip's is drawn up to this. Imagined depth is as wrong as that, or it drifts."""
+    """Largest noise on the observed first frame's depth, as a share of the depth; each clip draws
+    its own. It should match the error of imagined depth, or depth drifts in rollouts."""
     hidden: float = 0.0
-    """Share of clips from which the memory is hidden while it is read in training, so that the
-    model stays good without; for stages that train the backbone with a memory."""
+    """Share of clips whose memory is hidden in training, so that the model also works without one;
+    for stages that train the backbone with a memory."""
     chained: float = 0.0
-    """Share of clips that start from a frame of the model's own, as all but the first do in a
-    rollout: the clip is run backwards in one denoising step from a random level of noise, and
-    starts from what the model, without gradient, makes of its first frame (`worlds/objective.py`
-    says what that leaves out). Costs a forward pass for that share."""
+    """Share of clips that start from a frame predicted by the model, as all clips but the first do
+    in a rollout: the clip is run backwards in one denoising step from a random level of noise, and
+    starts from the model's prediction, without gradient, of its first frame (`worlds/objective.py`
+    documents the limits). Costs a forward pass for that share."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""
     grace_s: float = 30.0
@@ -215,13 +215,13 @@ class TrainConfig(TrainSettings):
     """Training of PEWM in two stages, as in the paper, and an optional third."""
 
     stage1: StageConfig = StageConfig()
-    """The backbone learns without memory: domain, camera control, RGB-D."""
+    """The backbone is trained without memory: domain, camera control, RGB-D."""
     stage2: StageConfig = StageConfig()
-    """Only the memory blocks learn; all other weights stay bit-identical."""
+    """Only the memory blocks are trained; all other weights stay bit-identical."""
     joint: StageConfig = StageConfig(steps=0)
-    """Backbone and memory blocks learn together (not in the paper); by default left out."""
+    """Backbone and memory blocks are trained together (not in the paper); skipped by default."""
     gate: StageConfig = StageConfig(steps=0)
-    """The codec's gate learns on what the model imagines (not the paper's); left out too."""
+    """The codec's gate is trained on imagined clips (not in the paper); skipped by default."""
     gate_lpips: float = 0.0
     """Weight of LPIPS (AlexNet's, `pip install 'pewm-jax[metrics]'`) in the loss of stage `gate`; 0
     leaves it out."""
@@ -232,7 +232,7 @@ class TrainConfig(TrainSettings):
         require(
             bool(self.start) or self.stage1.steps > 0 or self.stage2.steps == 0,
             f"train.stage1.steps is 0 and train.stage2.steps is {self.stage2.steps}: stage 2 "
-            "freezes the backbone, whose output starts at zero, so nothing would be learnt; give "
+            "freezes the backbone, whose output starts at zero, so nothing would be learned; set "
             "train.stage1.steps at least 1, or name trained weights by train.start.",
         )
         require(self.gate_lpips >= 0, f"train.gate_lpips is {self.gate_lpips}: use 0 or more.")
@@ -271,9 +271,9 @@ class EvalConfig:
     are installed and there is an accelerator: on processors it takes longer than imagining the
     clips."""
     mirror: int = -1
-    """Frames that the agent goes in the mirror test before it comes back the same way; 0 leaves it
-    out; -1 goes 32 where long rollouts have 64 frames or more, and else leaves it out: twice as
-    many frames are imagined from each of their starts."""
+    """Frames until the agent turns back in the mirror test, which imagines twice as many from each
+    start of the long rollouts; 0 disables it; -1 uses 32 if long rollouts have 64 frames or more,
+    else it disables the test."""
     src: tuple[str, ...] = ()
     """Encoders of SRC in the mirror test: `alex` or `vgg` of the installed LPIPS, folders with
     DINOv2, or `off`; if empty, that of LPIPS where LPIPS is measured."""

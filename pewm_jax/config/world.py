@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PLANAR = 3
 """Numbers of a planar action: metres forward, metres left, radians to the left."""
 SMALLEST = 12
-"""Smallest side of a clip in pixels: the evaluation's SSIM slides a window of 11 over the image."""
+"""Smallest side of a clip in pixels: the evaluation's SSIM uses a window of 11 pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,14 +62,14 @@ class ClipConfig:
         require(
             min(self.height, self.width) >= SMALLEST,
             f"clip.height {self.height} and clip.width {self.width} must be at least {SMALLEST} "
-            "pixels: the structural similarity of the evaluation looks through a window of 11; "
+            "pixels: the structural similarity of the evaluation uses a window of 11; "
             "use 16 or more.",
         )
 
 
 @dataclasses.dataclass(frozen=True)
 class ActionConfig:
-    """What one discrete action does to the agent."""
+    """The effect of one discrete action on the agent."""
 
     step_m: float = 0.25
     """Length of one forward step, metres."""
@@ -120,7 +120,7 @@ class BatchSpec:
 
 @dataclasses.dataclass(frozen=True)
 class Capabilities:
-    """What a world can do.
+    """The capabilities of a world.
 
     A command that needs a missing capability reports and omits that part, or refuses the world if
     nothing would remain.
@@ -216,8 +216,8 @@ class Task(Settings):
         TRAIN: the class of its training settings: ``TrainSettings`` with a ``StageConfig`` field
             for each of the task's stages, named as the stage.
         TRAINS: parts that other tasks take from ``train.start`` and this one trains itself.
-        INSTEAD: for error messages about a task that imagines nothing: what its run did, and what
-            to do with it: "trained a codec alone, which imagines nothing: …".
+        INSTEAD: for error messages about a task that imagines nothing: the purpose of its run, and
+            how to use it: "trained a codec alone, which imagines nothing: …".
         EXPORTED: whether ``export inference`` writes it with 16-bit weights.
         CARD: description and use in the model card of a task that is not a world; ``{version}`` and
             ``{name}`` are filled in.
@@ -278,7 +278,7 @@ class World(Task):
     ``jax.jit`` with the settings static.
 
     Attributes:
-        actions: what one discrete action does to the agent.
+        actions: the effect of one discrete action on the agent.
         sample_steps: steps of the sampler, 0 without one.
     """
 
@@ -286,7 +286,7 @@ class World(Task):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What it can do."""
+        """The capabilities of the world."""
         return Capabilities()
 
     @property

@@ -31,7 +31,7 @@ from pewm_jax.types import Array, Control, Frames, Params
 SLOWEST, FASTEST = math.pi / 4, 8 * math.pi
 """Radians of the slowest and the fastest sinusoid for a number of 1."""
 TAPS = 3
-"""Actions that a convolution sees at least."""
+"""Smallest kernel of a convolution, in actions."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,13 +51,13 @@ class ModulationConfig(Conditioner):
     actions: int = 3  # type: ignore[assignment]
     """Numbers of an action."""
     units: tuple[float, ...] = (1.0, 1.0, 1.0)
-    """What each number is first divided by: the data's waypoint spacing in metres, twice, and 1."""
+    """Divisor of each number: the data's waypoint spacing in metres, twice, and 1."""
     low: tuple[float, ...] = (-2.5, -4.0, -1.0)
-    """The value of each number, in its unit, that becomes −1."""
+    """The value of each number, in its unit, that is mapped to −1."""
     high: tuple[float, ...] = (5.0, 4.0, 1.0)
-    """The value of each number, in its unit, that becomes 1."""
+    """The value of each number, in its unit, that is mapped to 1."""
     angles: tuple[int, ...] = (2,)
-    """Which numbers are angles in radians: they are brought into (−π, π] at first."""
+    """Indices of angles in radians, which are first wrapped into (−π, π]."""
     projection: Literal["sinusoid", "convolution"] = "sinusoid"
     """`sinusoid`: cosines and sines of each number, then two layers (the paper's on Stable Video
     Diffusion). `convolution`: two layers, then two convolutions over time, down to the latent rate
@@ -66,11 +66,11 @@ class ModulationConfig(Conditioner):
     """Cosines and sines of each number, with `sinusoid`; even."""
     state: int = 0  # type: ignore[assignment]
     """Numbers of the agent's state at the first frame, which is added to every frame (Eq. 6): as
-    many as those of an action, which then says which state it leads to; 0 for none."""
+    many as those of an action, which is then the next state; 0 for none."""
     rays: bool = False
-    """Also join the cameras' Plücker rays to the input, as the control `camera` does."""
+    """Also concatenate the cameras' Plücker rays to the input, as the control `camera` does."""
     rate: float = 10.0  # type: ignore[assignment]
-    """Factor of the learning rate of these layers, which are new where a model was trained."""
+    """Factor of the learning rate of these layers, which are new in a pre-trained model."""
 
     def channels(self, model: Any) -> int:
         """Return the rays' channels, if they are joined."""

@@ -115,17 +115,17 @@ class FrameFlowConfig(FlowConfig):
     shift: float = 3.0
     """Time shift of the sampler: t → s t / (1 + (s − 1) t)."""
     times: Literal["uniform", "logit_normal", "ends"] = "logit_normal"  # type: ignore[assignment]
-    """Distribution of times in training. `ends`: half the frames at the time of those that are
-    given (`context_noise`), half at 1, which is all that a sampler of one step ever meets; it needs
+    """Distribution of times in training. `ends`: half the frames at the time of given frames
+    (`context_noise`), half at 1, which are the only times in a sampler of one step; it needs
     `per_frame`. Not as published."""
     shifted_times: bool = False
-    """Whether the times of training are shifted, too."""
+    """Whether the times of training are also shifted."""
     sample_steps: int = 20
     """Steps of the sampler, by Euler's method."""
     predicts: Literal["velocity", "x0"] = "velocity"
-    """What the network predicts. `velocity` as published. `x0`, the clean latents, where tokens
-    hold more numbers than the network is wide: noise has as many dimensions as a token, and what
-    does not pass through the network stays in the sample (arXiv 2511.13720)."""
+    """Prediction of the network: `velocity` as published, or `x0`, the clean latents, if tokens
+    have more numbers than the network's width: noise that does not fit through the network remains
+    in the sample (arXiv 2511.13720)."""
     smallest: float = 1e-5
     """The noise s that is left at t = 0."""
     context_noise: float = 0.02

@@ -29,9 +29,9 @@ from pewm_jax.registry import part
 from pewm_jax.types import Array, Camera, View
 
 UNKNOWN = -1
-"""The id of a cell of which nothing is known."""
+"""The id of an unknown cell."""
 EMPTY = 0
-"""The id of a cell in which nothing is."""
+"""The id of an empty cell."""
 
 
 @jax.tree_util.register_dataclass
@@ -186,19 +186,19 @@ class GridConfig(Memory):
     cells: tuple[int, int, int] = (192, 192, 48)
     """Cells that are kept along x, y, z; along z as many as a window has."""
     recorded: int = 64
-    """Cells along each side of the grids in the data: those of a window, and as many more as the
-    window may lie off the agent."""
+    """Cells along each side of the grids in the data: those of a window, and those by which the
+    window may be off the agent."""
     kinds: Literal["all", "groups"] = "all"
     """Which classes there are, as the data were collected (`--voxels.kinds`)."""
     colours: int = 16
     """Colours of each kind, as the data were collected (`--voxels.colours`)."""
     pictures: Literal["surfaces", "cells"] = "surfaces"
-    """What the data's images show, as they were collected (`--voxels.pictures`)."""
+    """Content of the data's images, as they were collected (`--voxels.pictures`)."""
     eye_m: float = 1.25
-    """Height of the camera above the floor, metres: where a world begins without a known grid, the
+    """Height of the camera above the floor, metres: if a world begins without a known grid, the
     floor is a border between cells."""
     reader: Reader = part("reader", "render")
-    """Nothing reads it but the networks of the world."""
+    """Not used: only the networks of the world read it."""
 
     @property
     def room(self) -> int:
@@ -224,8 +224,8 @@ class GridConfig(Memory):
         )
         require(
             self.recorded >= side + token and (self.recorded - side) % 2 == 0,
-            f"memory.recorded is {self.recorded}: use {side + token} or more, a window and what it "
-            "may lie off the agent, by an even number more than the window.",
+            f"memory.recorded is {self.recorded}: use {side + token} or more (a window and its "
+            "distance from the agent), by an even number more than the window.",
         )
 
     def empty(self, model: AssembledModel, centre_3: Array) -> ClassGrid:

@@ -1,4 +1,4 @@
-"""How much of what was seen before reaches the denoiser: remembered, chosen, attended to.
+"""The share of pixels seen before that reaches the denoiser: remembered, chosen, attended to.
 
 A pixel that was seen before can be known only if the memory holds its place, if that place is among
 the tokens that condition the clip, and if the frame's own camera attends to it; or, where the

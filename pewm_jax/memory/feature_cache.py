@@ -36,7 +36,7 @@ from pewm_jax.types import Array, Params
 
 MANIFEST = "cache.json"
 UNFINISHED = "caching.json"
-"""A file that says what an unfinished cache is being filled with."""
+"""The file with the settings of an unfinished cache."""
 TENSOR = "features_ThwF"
 VERSION = 1
 Dtype = Literal["float16", "bfloat16", "float32"]
@@ -146,7 +146,7 @@ def read(path: Path) -> FeatureCache:
     """
     if not (path / MANIFEST).is_file():
         begun = (path / UNFINISHED).is_file()
-        hint = "is not finished: the command that makes it goes on" if begun else "is no cache"
+        hint = "is not finished: run the command again to resume" if begun else "is no cache"
         raise UserError(f"{path} {hint}; make it with `pewm-jax memory cache DATA {path}`.")
     value = read_json(path / MANIFEST)
     try:
@@ -279,7 +279,7 @@ def _locked(out: Path) -> Iterator[None]:
 
 
 def _begin(out: Path, settings: Mapping[str, Any]) -> None:
-    """Record what a folder is being filled with, or compare with the earlier record."""
+    """Record the settings of an unfinished cache, or compare with the earlier record."""
     note = out / UNFINISHED
     if note.is_file():
         before = read_json(note)

@@ -1,4 +1,4 @@
-"""A compact set of snapshots that together show what was seen (after 3D-Mem, arXiv 2411.17735).
+"""A compact set of snapshots that covers the observed cells (after 3D-Mem, arXiv 2411.17735).
 
 3D-Mem clusters detected objects. Here, without a detector, a frame covers the set of map cells that
 its pixels fall into. Snapshots are chosen by greedy maximum coverage of all cells seen so far,
@@ -77,7 +77,7 @@ def greedy_cover(cell_XC: Array, count: int, nowhere: int) -> tuple[Array, Array
 
 @dataclasses.dataclass(frozen=True)
 class ImagesConfig(Memory):
-    """A few snapshots that together cover what was seen."""
+    """A few snapshots that together cover the observed cells."""
 
     snapshots: int = 8
     """Frames that are kept; together they have at most `tokens` patches."""

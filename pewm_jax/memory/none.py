@@ -1,4 +1,4 @@
-"""No memory: the baseline that knows only the present frame (NWM in the paper's Table 1).
+"""No memory: the baseline with only the present frame (NWM in the paper's Table 1).
 
 All its tokens are masked. The memory blocks still exist and their feed-forward networks are
 trained, so this baseline has the same number of trained parameters as the others.

@@ -27,17 +27,17 @@ TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.1
 """Points on one surface lie within the larger of 5 cm and 10 % behind its front (a floor seen at a
 grazing angle is that deep from pixel to pixel)."""
 LEAST = 1e-4
-"""The least share of a point that shows it."""
+"""The least share of a point at which it is visible."""
 RASTER, REACH, PILE = 64, 8, 8
-"""Of the images of cells, see ``splat_cells``."""
+"""Limits of the images of cells, see ``splat_cells``."""
 MIDDLE = 1e-3
-"""Pixels before its middle at which a point begins to count as at its middle."""
+"""Pixels before the middle of a pixel from which a point counts as at the middle."""
 BLOCK = 16
 """Slots that are drawn or left out together."""
 SHARE = 3 / 8
 """Of all blocks, how many are drawn in the branch where a camera sees only some of them."""
 WORTH_A_BRANCH = 4096
-"""Points in that branch from which it pays off."""
+"""Number of points from which that branch is faster."""
 
 
 def splat(
@@ -136,7 +136,7 @@ def splat_surfels(
             lambda: drawn(*everything),
         )
 
-    # Frame after frame: what one needs fits a processor's cache, which nine do not.
+    # Frame after frame: the data of one fit a processor's cache, those of nine do not.
     return _as_images(*jax.lax.map(one, jax.tree.map(jnp.asarray, camera)), height, width)
 
 
@@ -254,8 +254,8 @@ def _shares(
     pixels: int,
 ) -> Array:
     """Return (H·W, F + 2) sums of features, depth, if any the points facing away, and 1."""
-    # A place may be computed anew for each use, rounded to either side of the middle of a pixel,
-    # where a point that is seen again lies: the border between two pixels is moved from there.
+    # XLA may recompute positions for each use. A point that is observed again lies at the middle of
+    # a pixel, where rounding would be ambiguous: the border between two pixels is shifted.
     u, v = projected.u_V - 0.5, projected.v_V - 0.5
     column, row = (jnp.floor(x + MIDDLE).astype(jnp.int32) for x in (u, v))
     right, below = jnp.maximum(u - column, 0), jnp.maximum(v - row, 0)
@@ -269,7 +269,7 @@ def _shares(
     for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
         pixel, _ = visible(column + i, row + j)
         places.append((pixel, (right if i else 1 - right) * (below if j else 1 - below)))
-    # The barrier keeps XLA from computing these anew for every channel.
+    # The barrier keeps XLA from recomputing these for every channel.
     places, values_VC = jax.lax.optimization_barrier((places, values_VC))
     total = jnp.zeros((pixels, values_VC.shape[-1]))
     for pixel, weight in places:

@@ -32,7 +32,7 @@ from pewm_jax.types import Array, Camera, Frames, MapTokens, Params
 COLUMNS = 10
 """The columns of ``sums_VC`` before features: how many points, their offsets, colours, normals."""
 TURNED = 0.5
-"""The mean of a cell's normals is at least so long, or it is seen from both sides."""
+"""Least length of the mean of a cell's normals; below it the surfel faces both sides."""
 
 
 @jax.tree_util.register_dataclass
@@ -256,28 +256,28 @@ class SurfelConfig(Memory):
     GRID_TOLERANCE: ClassVar[int] = 1
 
     cell_m: tuple[float, float, float] = (0.04, 0.04, 0.04)
-    """Size of a cell along x, y, z, metres: of all that was seen in one, one surfel is kept."""
+    """Size of a cell along x, y, z, metres; each cell keeps one surfel."""
     cells: tuple[int, int, int] = (1024, 1024, 128)
     """Cells of the grid along x, y, z; the extent costs nothing."""
     capacity: int = 65536
-    """Surfels that can be kept; what does not fit is counted."""
+    """Surfels that can be kept; others are counted and dropped."""
     keep: Literal["mean", "newest"] = "mean"
-    """Of what was seen in one cell: the mean of all, or what the newest frame showed."""
+    """Content of a cell: the mean of all points, or those of the newest frame."""
     protect: bool = True
-    """What was imagined never changes what was observed."""
+    """Whether imagined points never change observed cells."""
     features: bool = False
     """Keep the encoder's features beside the colour, and give them to the reader."""
     footprint: int = 3
     """Pixels that a surfel covers at most, across and down, when the memory is rendered."""
     sides: bool = True
-    """Show a surfel only from the side it was seen from; from behind it hides what it hides, and
-    nobody knows what it looks like: a wall of the room next door."""
+    """Show a surfel only from the side it was observed from. From behind, such as a wall of the
+    next room, it occludes but is not shown, because its colour there is unknown."""
     imagined_again: bool = False
-    """Also remember imagined pixels at which the memory showed something when they were imagined;
-    else only what is new, so that a surface does not grow with every look at it. Needs a reader or
-    a gate for which the memory is rendered."""
+    """Also insert imagined pixels where the memory was already rendered; else only new surfaces, so
+    that surfaces do not grow with every clip. Needs a reader or a gate for which the memory is
+    rendered."""
     observed_first: bool = True
-    """Show what was imagined only where nothing that was observed is shown."""
+    """Render imagined surfels only where no observed surfel is visible."""
 
     @property
     def KEEPS_FEATURES(self) -> bool:  # noqa: N802  # type: ignore[override]

@@ -75,8 +75,8 @@ def _embeddings(model: AssembledModel) -> tuple[modules.nn.Dense, modules.nn.Den
     """Return the linear layers of rays (one vector per video token) and map tokens."""
     dtype = jnp.dtype(model.dtype)
     camera = modules.dense(model.backbone.places.width // 2, dtype, "camera")
-    # A layer norm follows, which would discard the magnitude of the features. A random bias of
-    # unit variance keeps it visible.
+    # The layer norm that follows discards the magnitude of the features; a random bias of unit
+    # variance preserves it.
     constant = modules.nn.initializers.normal(1.0)
     width = _settings(model).width
     tokens = modules.nn.Dense(width, dtype=dtype, bias_init=constant, name="tokens")
@@ -123,7 +123,7 @@ class AttentionConfig(Reader):
         cameras = model.codec.temporal * model.backbone.places.patch_t
         require(
             self.positions == "sinusoid" or self.heads >= cameras,
-            f"memory.reader.heads is {self.heads}: with projective positions head k looks through "
+            f"memory.reader.heads is {self.heads}: with projective positions head k uses "
             f"camera k mod {cameras} (codec.temporal × backbone.patch_t) of a token's frames; use "
             f"at least {cameras} heads, or memory.reader.positions sinusoid.",
         )

@@ -164,14 +164,14 @@ class RenderConfig(Reader):
     READS_VIEW: ClassVar[bool] = True
 
     picture: Literal["pixels", "latents"] = "pixels"
-    """What a token gets of the picture: the `pixels` that it stands for, or the `latents` that the
-    codec makes of them, holes filled; these only of memories that show colours."""
+    """Input of a token: its `pixels` of the rendered memory, or the codec's `latents` of them,
+    holes filled; latents only for memories that show colours."""
     picture_width: int = 128
-    """Channels of a token's part of the picture, embedded."""
+    """Channels of a token's embedded part of the rendered memory."""
     reduced: int = 8
-    """Pictures of more channels are first reduced to this many, at every pixel."""
+    """Renderings with more channels are first reduced to this number, at every pixel."""
     blocks: bool = True
-    """Also give the picture to a memory block after every block of the backbone; else only to its
+    """Also give the rendering to a memory block after every block of the backbone; else only to its
     input."""
     mlp_ratio: int = 2
     """Hidden channels of such a block over model width."""
@@ -228,7 +228,7 @@ class RenderConfig(Reader):
         rays_BthwC: Array,
     ) -> Readers:
         """Embed the memory's views."""
-        del camera, rays_BthwC  # the pictures are what these cameras see
+        del camera, rays_BthwC  # the views are those of these cameras
         places, weights = model.backbone.places, params["render"]
         embed = functools.partial(_apply, model, weights)
         layout = TokenLayout.for_mesh(text_tokens(model), *video_tokens(model))
@@ -236,7 +236,7 @@ class RenderConfig(Reader):
         read_BthwC, seen_B = cells(model, weights, readout)
         patches = patchify(pad_time(read_BthwC, places.patch_t), places.patch, places.patch_t)
         picture: Array = embed("embed_2", jax.nn.silu(embed("embed_1", patches)))
-        # A clip whose cameras see nothing of the memory is left alone.
+        # A clip whose cameras see nothing of the memory is not changed.
         shown = (seen_B | (not model.memory.REMEMBERS))[:, None, None]
         added = layout.spread(jnp.where(shown, embed("added", picture), 0))
         if not self.blocks:

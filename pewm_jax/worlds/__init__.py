@@ -328,7 +328,7 @@ def memory_points(
 
 
 def erase(model: Config | Task, params: Params, state: WorldState, box_23: Array) -> WorldState:
-    """Return a world that forgot what is in a box; see ``World.erase``."""
+    """Return a world without the content of a box; see ``World.erase``."""
     model = require_world(model_of(model), "erase()")
     return model.erase(forms.in_world_form(model, params), state, box_23)
 
@@ -342,7 +342,7 @@ def move(
     *,
     leave: bool = False,
 ) -> WorldState:
-    """Return a world in which what is in a box was moved; see ``World.move``."""
+    """Return a world whose content of a box is moved; see ``World.move``."""
     model = require_world(model_of(model), "move()")
     return model.move(forms.in_world_form(model, params), state, box_23, transform, leave=leave)
 

@@ -43,7 +43,7 @@ from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 SMALL = 1e-4
 """Added to variances."""
 PULL = 1e-2
-"""Weight of what keeps each channel of the latents near mean 0 and variance 1."""
+"""Weight of the term that keeps each channel of the latents near mean 0 and variance 1."""
 ABSOLUTE = 0.1
 """Weight of the absolute error beside the squared one."""
 LPIPS: lpips.Net = "alex"
@@ -57,7 +57,7 @@ GATE = r"codec/gate/.*"
 
 @dataclasses.dataclass(frozen=True)
 class CodecTrainConfig(TrainSettings):
-    """How the codec is trained: on reconstruction, then on the distribution of its latents."""
+    """Training of the codec: reconstruction, then the distribution of its latents."""
 
     ZERO: ClassVar[dict[str, str]] = {
         "preview_every": "a codec imagines nothing (pewm-jax evaluate prints its numbers)"
@@ -66,7 +66,7 @@ class CodecTrainConfig(TrainSettings):
     run: str = "runs/codec"
     """Folder of this run: checkpoints, logs, numbers."""
     preview_every: int = 0
-    """Steps between sample pictures; 0, since a codec imagines none."""
+    """Steps between sample images; must be 0, because a codec imagines none."""
     codec: StageConfig = StageConfig(steps=2000, batch=32)
     """The codec learns to reconstruct frames."""
     statistics: StageConfig = StageConfig(steps=200, batch=32, learning_rate=0.03, warmup=0)
@@ -74,18 +74,18 @@ class CodecTrainConfig(TrainSettings):
     gate: StageConfig = StageConfig(batch=12, warmup=30)
     """The gate is trained, all else is frozen; only if `codec.gate` is set."""
     gate_noise: float = 0.8
-    """Largest noise on the latents while the gate learns, as a share of their deviation; each clip
-    draws its own."""
+    """Largest noise on the latents in stage `gate`, as a share of their deviation; each clip draws
+    its own."""
     latent_noise: float = 0.05
-    """Noise on the latents while the codec learns, as a share of each channel's deviation."""
+    """Noise on the latents in stage `codec`, as a share of each channel's deviation."""
     gradient_weight: float = 1.0
-    """Weight of the absolute difference of neighbouring pixels' differences, beside that of the
-    pixels themselves."""
+    """Weight of the absolute error of differences between neighbouring pixels, relative to that of
+    the pixels."""
     squared_weight: float = 4.0
     """Weight of the squared error."""
     lpips_weight: float = 0.0
-    """Weight of LPIPS, a learned distance between pictures, of the colours given back; 0 leaves it
-    out."""
+    """Weight of LPIPS, a learned distance between images, of the reconstructed colours; 0 disables
+    it."""
     lpips_net: Literal["alex", "vgg"] = "alex"
     """The network of LPIPS: AlexNet, or VGG16, which its authors recommend as a loss and which
     costs 30 times as much."""
@@ -124,17 +124,17 @@ class CodecTask(Task):
     )
 
     clip: ClipConfig = ClipConfig(frames=2)
-    """What the loader reads; every frame of a clip is a sample by itself."""
+    """Shape of the loaded clips; every frame is a sample."""
     codec: LearnedCodecConfig = part("codec", "learned")
     """The codec that is trained."""
     memory: Memory = part("memory", "surfels")
-    """The memory that the gate sees rendered; it must show colours."""
+    """The memory that is rendered for the gate; it must show colours."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Compute precision; master weights of what trains stay float32."""
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """Context where a gate is trained, which sees it rendered."""
+        """Context, if a gate is trained."""
         return BatchSpec(context=bool(getattr(self.codec, "gate", 0)))
 
     def __post_init__(self):

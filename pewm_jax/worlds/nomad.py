@@ -38,23 +38,22 @@ SMALL = 1e-2
 
 @dataclasses.dataclass(frozen=True)
 class NomadTrainConfig(TrainSettings):
-    """How the policy is trained: by imitation of recorded walks."""
+    """Training of the policy by imitation of recorded walks."""
 
     ZERO: ClassVar[dict[str, str]] = {"preview_every": "a policy imagines nothing"}
 
     run: str = "runs/nomad"
     """Folder of this run: checkpoints, logs, numbers."""
     preview_every: int = 0
-    """Steps between sample pictures; 0, since a policy imagines none."""
+    """Steps between sample images; must be 0, because a policy imagines none."""
     policy: StageConfig = StageConfig(steps=2000, batch=32, learning_rate=1e-4)
     """The policy is trained to imitate the recorded walks."""
     goal_hidden: float = 0.5
     """Share of clips whose goal is hidden, so that the policy also explores without one."""
     distance_weight: float = 1e-4
-    """Weight of the squared error of the distance, in steps; that of the noise is the rest to
-    1."""
+    """Weight of the squared error of the distance, in steps; 1 minus it is that of the noise."""
     nearest: int = 3
-    """A goal this near, or nearer, in steps, teaches its distance alone: the walk went past it."""
+    """Goals up to this many steps away train only the distance: the walk went past them."""
 
     def __post_init__(self):
         """Validate."""
@@ -82,7 +81,7 @@ class NomadTask(Task):
     )
 
     clip: ClipConfig = ClipConfig(frames=24)
-    """What the loader reads: earlier pictures, the present one, and as many later ones as a goal
+    """Shape of the loaded clips: earlier images, the present one, and as many later ones as a goal
     may be away."""
     actions: ActionConfig = ActionConfig()
     """Effect of an action in the walks."""
@@ -93,7 +92,7 @@ class NomadTask(Task):
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """The clip's frames alone."""
+        """The clip's frames."""
         return BatchSpec(context=False)
 
     @property

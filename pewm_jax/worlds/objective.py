@@ -32,9 +32,9 @@ from pewm_jax.worlds import world_model
 from pewm_jax.worlds.control import require_actions
 
 BROAD = 8
-"""Pixels, each way, over which the noise on depth is alike."""
+"""Pixels, along each axis, per cell of the broad noise on depth."""
 FINE = 0.3
-"""The noise on depth that differs from pixel to pixel, as a share of the broad noise."""
+"""The noise on depth of each pixel, as a share of the broad noise."""
 
 
 def clip_readout(
@@ -232,7 +232,7 @@ def first_frames(
     if model.control.actions:
         raise UserError(
             "train.chained is above 0, which runs clips backwards, but this model's control needs "
-            "actions, and nobody knows those of the way back: use a control by cameras "
+            "actions, which are unknown for the way back: use a control by cameras "
             "(control.kind camera), or train.chained 0."
         )
     batch = len(frames.depth_THW)

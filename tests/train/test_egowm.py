@@ -165,7 +165,7 @@ def test_what_does_not_fit_the_u_net_is_refused():
             continue
         with pytest.raises(ConfigError, match=says):
             dataclasses.replace(SVD, **changes)
-    with pytest.raises(ConfigError, match="no place where a memory could be read"):
+    with pytest.raises(ConfigError, match="no injection point for a memory"):
         dataclasses.replace(TINY, backbone=UNET)
 
 

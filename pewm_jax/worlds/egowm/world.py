@@ -38,7 +38,7 @@ from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 @dataclasses.dataclass(frozen=True)
 class EgoWMTrainConfig(TrainSettings):
-    """How a video model becomes a world model: the whole backbone is trained, with actions."""
+    """Training of a video model as a world model: the whole backbone, with actions."""
 
     ZERO: ClassVar[dict[str, str]] = {
         "hidden": "this world has no memory to hide",
@@ -48,16 +48,16 @@ class EgoWMTrainConfig(TrainSettings):
     run: str = "runs/egowm"
     """Folder of this run: checkpoints, logs, images, report."""
     video: StageConfig = StageConfig(steps=0)
-    """If there is no pre-trained video model, the backbone first becomes one, without actions; by
-    default left out. A random backbone trained with actions from the start would not learn to
-    follow them: the control and what it modulates are initialized with zeros, so neither gets a
+    """Trains a video model without actions, if there is no pre-trained one; skipped by default. A
+    random backbone that is trained with actions from the start does not learn to follow them: the
+    control and the layers that it modulates are initialized with zeros, so neither gets a
     gradient."""
     adapt: StageConfig = StageConfig()
     """The backbone is trained further, with actions; the control's learning rate is
     `model.control.rate` times this one's."""
     blind: float = 0.1
-    """Share of clips from which is hidden what guidance is on, the observed image or the text;
-    needed for `model.noise.guidance` above 1."""
+    """Share of clips without the input of guidance (the observed image or the text); needed for
+    `model.noise.guidance` above 1."""
 
     def __post_init__(self):
         """Validate."""
@@ -75,23 +75,23 @@ class EgoWM(AssembledModel):
     control: Conditioner = part("control", "actions")
     """Control: what steers a clip."""
     memory: Memory = part("memory", "none", reader=part("reader", "render"))
-    """There is none: leave it at `none`."""
+    """No memory: leave it at `none`."""
     history: int = 1
-    """Frames that every clip begins with and that are observed, or were imagined before: 1 in
-    Stable Video Diffusion and CogVideoX; more where a backbone learns with more. They fill latent
+    """Frames at the beginning of every clip that are observed, or were imagined before: 1 in Stable
+    Video Diffusion and CogVideoX; more if the backbone is trained with more. They fill latent
     frames: with `codec.temporal` 4, use 4k + 1."""
     image_noise: float = 0.0
-    """Deviation of the noise on these frames while imagining; the paper's is 0.1, with Stable Video
-    Diffusion. In training it is drawn as `train` says."""
+    """Deviation of the noise on these frames in rollouts; the paper's is 0.1, with Stable Video
+    Diffusion. The settings of `train` determine it in training."""
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """The clip's frames and actions alone."""
+        """The clip's frames and actions."""
         return dataclasses.replace(super().batch_spec, context=False, features=None)
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a world without a memory can do."""
+        """The capabilities of a world without a memory."""
         return dataclasses.replace(super().capabilities, memory_parameters="")
 
     def __post_init__(self):
@@ -112,7 +112,7 @@ class EgoWM(AssembledModel):
             self.noise.guidance == 1
             or not self.backbone.GUIDED_BY_TEXT
             or self.backbone.stores_prompt,
-            f"noise.guidance is {self.noise.guidance}, which this backbone has on its text, and no "
+            f"noise.guidance is {self.noise.guidance}, which guides this backbone by text, and no "
             "text is stored: use backbone.prompt stored and weights that were imported with a text "
             "encoder, or noise.guidance 1.",
         )
@@ -216,7 +216,7 @@ class EgoWM(AssembledModel):
         """
         before = self.history - 1
         actions = control.actions_TA
-        if actions is not None:  # of those that led to the past frames the control makes nothing
+        if actions is not None:  # the control ignores actions before the present frame
             actions = jnp.pad(actions, ((before, 0), (0, 0)))
         camera = _joined(past.camera, control.camera)
         noise_key, key = jax.random.split(key)

@@ -28,7 +28,7 @@ POINT_WAVES = 4
 
 @dataclasses.dataclass(frozen=True)
 class PersistTrainConfig(TrainSettings):
-    """How the world is trained: one network after the other; the codec of pictures is frozen."""
+    """Training of the networks, one after the other; the codec of images is frozen."""
 
     ZERO: ClassVar[dict[str, str]] = dict.fromkeys(
         ("hidden", "chained"), "it is for worlds with memory blocks"
@@ -40,7 +40,7 @@ class PersistTrainConfig(TrainSettings):
     """Parameter paths (regular expressions) that may be missing from the weights a stage starts
     from; these parameters start at random."""
     preview_every: int = 0
-    """Steps between sample pictures; 0 for none: a picture needs all the networks."""
+    """Steps between sample images; 0 for none: an image needs all the networks."""
     voxel_vae: StageConfig = StageConfig()
     """The autoencoder of voxels."""
     voxel_statistics: StageConfig = StageConfig(steps=60, learning_rate=0.03, warmup=0)
@@ -52,17 +52,16 @@ class PersistTrainConfig(TrainSettings):
     renderer: StageConfig = StageConfig()
     """The transformer that renders voxels."""
     blind: float = 0.3
-    """Share of frames after the first that are not conditioned on a picture."""
+    """Share of frames after the first that are not conditioned on an image."""
 
     occupied: float = 1.0
-    """Weight of the error of a world frame's latent whose cells are not all air; 1 as published.
-    Most cells are air."""
+    """Weight of the error of latents with occupied cells; 1 as published. Most cells are air."""
     classes: float = 0.0
     """Weight of the cross-entropy of a world frame's classes, through the frozen decoder, relative
     to the error of its latents; 0 as published. It needs a decoder that decodes one latent at a
     time (`voxel_vae.kernel` and `middle_kernel` 1, one number of `widths`)."""
     compared: int = 256
-    """Latents of a frame whose classes are compared, drawn by the weights of their errors."""
+    """Latents per frame in the cross-entropy of `classes`, drawn by the weights of their errors."""
 
     def __post_init__(self):
         """Validate."""
@@ -99,7 +98,7 @@ class PersistModel(AssembledModel):
     clip: ClipConfig = PUBLISHED_CLIP
     """Shape of a clip."""
     codec: Codec = part("codec", "learned")
-    """Codec: pictures to latents and back."""
+    """Codec: images to latents and back."""
     backbone: PersistNetsConfig = part("backbone", "persist")
     """The four networks."""
     control: Conditioner = part(
@@ -111,24 +110,24 @@ class PersistModel(AssembledModel):
         high=(1.0,) * ACTIONS,
         angles=(),
     )
-    """The numbers of an action; nothing else of it is used."""
+    """The numbers of an action; its other settings are not used."""
     memory: GridConfig = part("memory", "grid")
     """The state of the world."""
     noise: Noise = part("noise", "frame_flow", per_frame=True, context_noise=0.1)
-    """Noise of pictures, sampler."""
+    """Noise of images, sampler."""
     voxel_noise: Noise = part("noise", "frame_flow", per_frame=True)
     """Noise of voxel frames, sampler."""
     persistence_logit: float = 0.0
-    """Nats by which another class must be likelier than the one that a cell has had before the cell
-    changes; 0 as published. Small networks forget without it."""
+    """Nats by which another class must be likelier than a cell's previous class to replace it; 0 as
+    published. Small networks forget without it."""
     empty_prior: float = 0.0
-    """Nats by which a class must be likelier than air in a cell of which nothing was known; 0 as
-    published. Small networks fill unknown cells with clutter without it."""
+    """Nats by which a class must be likelier than air in an unknown cell; 0 as published. Small
+    networks fill unknown cells with clutter without it."""
     observation_logit: float = 0.0
-    """Nats that a real picture of blocks (`memory.pictures cells`) adds to the class that it shows
-    in a cell: air before the measured depth, a surface at it; 0 as published."""
+    """Nats that a real image of blocks (`memory.pictures cells`) adds to the class that it shows in
+    a cell: air before the measured depth, a surface at it; 0 as published."""
     points: bool = False
-    """Whether the picture that conditions a voxel frame has the positions of its surfaces, from
+    """Whether the image that conditions a voxel frame has the positions of its surfaces, from
     depth, as further channels; not as published."""
     dead_reckoning: bool = False
     """Whether the camera model predicts how a step differs from the planar action, instead of the
@@ -146,7 +145,7 @@ class PersistModel(AssembledModel):
 
     @property
     def capabilities(self) -> Capabilities:
-        """What a world of voxels can do; all its stages train with them."""
+        """The capabilities of a world of voxels, all of whose stages train with voxels."""
         return dataclasses.replace(super().capabilities, stage_without_memory=False)
 
     @property
@@ -161,12 +160,12 @@ class PersistModel(AssembledModel):
 
     @property
     def picture_channels(self) -> int:
-        """Channels of a picture's latents; those of depth are among them if depth is imagined."""
+        """Channels of an image's latents, including those of depth if depth is imagined."""
         return self.codec.channels if self.clip.depth else self.codec.rgb_channels
 
     @property
     def shown_channels(self) -> int:
-        """Channels of the picture that conditions a voxel frame."""
+        """Channels of the image that conditions a voxel frame."""
         return self.picture_channels + (6 * POINT_WAVES if self.points else 0)
 
     def __post_init__(self):
@@ -182,8 +181,8 @@ class PersistModel(AssembledModel):
         for name in ("noise", "voxel_noise"):
             require(
                 getattr(self, name).per_frame,
-                f"model.{name}.per_frame is false, and every frame of this world has a time of its "
-                "own: use true.",
+                f"model.{name}.per_frame is false, and every frame of this world has its own time: "
+                "use true.",
             )
         logits = ("persistence_logit", "empty_prior", "observation_logit")
         require_fields(self, "model", lambda value: value >= 0, "0 or more nats", *logits)

@@ -33,8 +33,8 @@ from pewm_jax.types import Array, Camera, Params
 
 Measured = dict[str, Array]
 Compare = Callable[[Array, Array, Array], tuple[Array, Array]]
-"""``(x0_BTxyzC, weight_BTxyz, key) -> (error, right)``: another error of what is predicted, () and
-already weighted, and the share that is right; see ``losses.compared``."""
+"""``(x0_BTxyzC, weight_BTxyz, key) -> (error, right)``: a further error of the prediction, () and
+already weighted, and the share of correct classes; see ``losses.compared``."""
 
 
 def leading_actions(actions_BTA: Array) -> Array:
@@ -231,7 +231,7 @@ def class_error(
         jnp.take_along_axis(flat, drawn, 1).reshape(frames * count, -1),
         jnp.take_along_axis(cells, drawn, 1).reshape(frames * count, -1),
     )
-    # A frame of which nothing is known draws latents that do not count.
+    # Latents drawn from an unknown frame do not count.
     counts = jnp.repeat((weight.sum(1) > 0).astype(jnp.float32), count)
     share = counts / jnp.maximum(counts.sum(), 1)
     return (error * share).sum(), (right * share).sum()

@@ -170,5 +170,5 @@ STAGES = (
     _stage(4, "camera", r"camera_model/.*", 3, camera, prepare.cameras),
     _stage(5, "renderer", r"renderer/.*", 4, renderer, prepare.layers),
 )
-"""The stages, in order. The codec of pictures is given (``train.start``): the world ``codec``
-trains it."""
+"""The stages, in order. The codec of images comes from ``train.start``: the world ``codec`` trains
+it."""

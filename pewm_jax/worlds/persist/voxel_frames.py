@@ -149,7 +149,7 @@ def _condition(model: PersistModel, history: History, middle_3: Array) -> dict[s
 
 
 INTO_M = 0.005
-"""A measured point belongs to the cell this far behind it, metres; depth is kept in millimetres."""
+"""A measured point belongs to the cell this far behind it, metres; depth has millimetres."""
 VOTES = 2
 """Pixels that must show a surface in a cell: a single one may be a ray that clips an edge."""
 NEAREST_M = 0.05
@@ -199,7 +199,7 @@ def observe_cells(
     hits = jnp.zeros(side**3 + 1, jnp.int32).at[cell].add(1)[:-1]
     surface = (hits >= VOTES).reshape((side,) * 3)
 
-    # What lights the cells that are seen is known, so their own colours are.
+    # The light on visible cells is known, and so are their own colours.
     borders = block_light.side_of((way_HW3 + (eye - corner_3)) / size)
     ones = jnp.ones(depth_HW.shape)
     lit = block_light.light(surface, corner_3, size, eye, way_HW3, ones, borders)

@@ -151,7 +151,7 @@ def _start_in(
     params, frames = _as_arrays(params, as_signal(frames))
     empty = model.memory.empty(model, frames.camera.world_from_camera[0, :3, 3])
     size, origin = model.cell, jnp.asarray(origin_3, jnp.float32)
-    # The world's cells are laid where the given ones are, and their heights where those are.
+    # The world's lattice of cells is that of the given ones.
     off = jnp.round((empty.low_3 - origin) / size)
     low = origin + off * size
     given = jnp.asarray(classes_XYZ).astype(jnp.int16)
