@@ -67,7 +67,7 @@ HOMES = {
     "tensorboardX": {"train/log"},
     "torch": {"convert", "eval/metrics/sam2"},
     "transformers": {"convert", "eval/metrics/sam2"},
-    "trimesh": {"data", "houses"},
+    "trimesh": {"data", "houses", "memory/voxel_files"},
     "tyro": {"cli", "convert/options", "data", "memory/feature_cache"},
     "viser": {"play/extra"},
     "wandb": {"train/log"},

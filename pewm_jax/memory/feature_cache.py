@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -119,23 +120,23 @@ def features(
 def refuse_stale(path: Path, have: Mapping[str, Any], want: Mapping[str, Any]) -> None:
     """Refuse a cache whose fingerprint is not the one wanted; the error names the difference."""
     again = "make it again with `pewm-jax memory cache` in a new folder"
-    for key in ("encoder", "network", "preprocessing"):
+    titles = {
+        "encoder": "another encoder",
+        "network": "another network",
+        "preprocessing": "other preprocessing",
+        "weights": "other encoder weights",
+        "data": "other data",
+    }
+    for key, title in titles.items():
         old, new = have.get(key), want[key]
-        if old != new:
-            if isinstance(old, dict) and isinstance(new, dict):
-                names = sorted(n for n in old.keys() | new.keys() if old.get(n) != new.get(n))
-                old, new = ({n: d.get(n) for n in names} for d in (old, new))
-            titles = {"network": "another network", "encoder": "another encoder"}
-            raise UserError(
-                f"{path} is stale: it was made with {titles.get(key, f'other {key}')} ({old}, now "
-                f"{new}); {again}."
-            )
-    for key, what in (("weights", "other encoder weights"), ("data", "other data")):
-        if have.get(key) != want[key]:
-            raise UserError(
-                f"{path} is stale: it was made with {what} (hash {str(have.get(key))[:12]}, now "
-                f"{want[key][:12]}); {again}."
-            )
+        if old == new:
+            continue
+        if isinstance(old, dict) and isinstance(new, dict):
+            names = sorted(n for n in old.keys() | new.keys() if old.get(n) != new.get(n))
+            old, new = ({n: d.get(n) for n in names} for d in (old, new))
+        if key in ("weights", "data"):
+            old, new = f"hash {str(old)[:12]}", new[:12]
+        raise UserError(f"{path} is stale: it was made with {title} ({old}, now {new}); {again}.")
 
 
 def read(path: Path) -> FeatureCache:
@@ -211,7 +212,7 @@ def build(
     files: dict[str, tuple[str, int]] = {}
     with _locked(out):
         _begin(out, settings)
-        encode = _Encoder(config, params, batch, log)
+        encode = _encoder_of(config, params, batch, log)
         with Meter("features", source.manifest.frames, "frames") as meter:
             for index in range(len(source)):
                 episode: Episode = source[index]
@@ -232,38 +233,38 @@ def build(
     return FeatureCache(out, made_of, files)
 
 
-class _Encoder:
-    """The encoder compiled for batches of frames, spread over all devices."""
+def _encoder_of(
+    config: Encoder, params: Params, batch: int, log: Callable[[str], None]
+) -> Callable[[Episode, Callable[[int], None]], np.ndarray]:
+    """Return a function from episodes to float32 features, by batches spread over all devices."""
+    devices = jax.devices()
+    mesh = jax.make_mesh((len(devices),), ("frames",), (AxisType.Auto,), devices=devices)
+    spread = NamedSharding(mesh, P("frames"))
+    weights_there = jax.device_put(params, NamedSharding(mesh, P()))
+    size = -(-batch // len(devices)) * len(devices)
+    compiled = set()
 
-    def __init__(self, config: Encoder, params: Params, batch: int, log: Callable[[str], None]):
-        devices = jax.devices()
-        mesh = jax.make_mesh((len(devices),), ("frames",), (AxisType.Auto,), devices=devices)
-        self._spread = NamedSharding(mesh, P("frames"))
-        self._params = jax.device_put(params, NamedSharding(mesh, P()))
-        self._batch = -(-batch // len(devices)) * len(devices)
-        self._say, self._compiled = log, set()
+    @functools.partial(jax.jit, out_shardings=spread)
+    def encode(params: Params, rgb_THWC: Array) -> Array:
+        return config.encode(params, signal_from_rgb(rgb_THWC))
 
-        def encode(params: Params, rgb_THWC: Array) -> Array:
-            return config.encode(params, signal_from_rgb(rgb_THWC))
-
-        self._encode = jax.jit(encode, out_shardings=self._spread)
-
-    def __call__(self, episode: Episode, advance: Callable[[int], None]) -> np.ndarray:
-        """Return an episode's features (T, h, w, F) in float32."""
-        size = (episode.height, episode.width)
-        if size not in self._compiled:
-            self._compiled.add(size)
-            self._say(f"compiling the encoder for {self._batch} frames of {size[1]}×{size[0]} …")
+    def features(episode: Episode, advance: Callable[[int], None]) -> np.ndarray:
+        if (episode.height, episode.width) not in compiled:
+            compiled.add((episode.height, episode.width))
+            shape = f"{episode.width}×{episode.height}"
+            log(f"compiling the encoder for {size} frames of {shape} …")
         found = []
-        for start in range(0, episode.length, self._batch):
-            chosen = np.arange(start, min(start + self._batch, episode.length))
+        for start in range(0, episode.length, size):
+            chosen = np.arange(start, min(start + size, episode.length))
             rgb = episode.frames(chosen).rgb_THWC
-            rest = np.zeros((self._batch - len(rgb), *rgb.shape[1:]), rgb.dtype)
-            rgb = jax.device_put(np.concatenate([rgb, rest]), self._spread)
-            out = jax.device_get(self._encode(self._params, rgb))[: len(chosen)]
+            rest = np.zeros((size - len(rgb), *rgb.shape[1:]), rgb.dtype)
+            rgb = jax.device_put(np.concatenate([rgb, rest]), spread)
+            out = jax.device_get(encode(weights_there, rgb))[: len(chosen)]
             found.append(np.asarray(out, np.float32))
             advance(len(chosen))
         return np.concatenate(found)
+
+    return features
 
 
 @contextlib.contextmanager

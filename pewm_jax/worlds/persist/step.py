@@ -6,6 +6,7 @@ Frames are processed one by one, so arrays have no batch axis; the networks get 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -121,14 +122,32 @@ def draw_latents(
     return encode_picture(model, params, view.features_THWF[0], view.depth_THW[0])
 
 
-def sample(
-    model: PersistModel,
-    params: Params,
-    features: Array,
-    action_A: Array,
-    cache: FrameCache,
-    key: Array,
-) -> Array:
+Render = Callable[[Array, Array], tuple[Array, FrameCache]]
+"""``(x, times_BT) -> (prediction, cache)``: the renderer of one frame."""
+
+
+def renderer(
+    model: PersistModel, params: Params, features: Array, action_A: Array, cache: FrameCache
+) -> Render:
+    """Return the renderer of a frame with these features, after the frames in the cache."""
+    config, noise = model.backbone.renderer, model.noise
+
+    def render(x: Array, times_BT: Array) -> tuple[Array, FrameCache]:
+        inputs, network_times = noise.precondition(x, times_BT)
+        return voxel_renderer.apply(
+            config,
+            params["renderer"],
+            inputs.astype(jnp.dtype(model.dtype)),
+            network_times,
+            features,
+            actions_BTA=action_A[None, None] if config.actions else None,
+            cache=cache,
+        )  # type: ignore[return-value]
+
+    return render
+
+
+def sample(model: PersistModel, render: Render, key: Array) -> Array:
     """Sample the latents (h, w, C) of an image of the voxels."""
     config, noise = model.backbone.renderer, model.noise
     shape = (1, 1, config.height, config.width, config.latent_channels)
@@ -136,46 +155,14 @@ def sample(
     def denoise(x: Array, time_B: Array, weight: Array) -> Array:
         del weight
         times = time_B[:, None]
-        made, _ = _render(model, params, x, times, features, action_A, cache)
-        return noise.to_x0(made.astype(jnp.float32), x, times)
+        return noise.to_x0(render(x, times)[0].astype(jnp.float32), x, times)
 
     return noise.sample(denoise, jax.random.normal(key, shape))[0, 0]
 
 
-def add_picture(
-    model: PersistModel,
-    params: Params,
-    latents_hwC: Array,
-    features: Array,
-    action_A: Array,
-    cache: FrameCache,
-    key: Array,
-) -> FrameCache:
+def add_picture(model: PersistModel, render: Render, latents_hwC: Array, key: Array) -> FrameCache:
     """Add an image to the renderer's cache."""
-    x, times = noisy_context(model.noise, latents_hwC[None, None], key)
-    return _render(model, params, x, times, features, action_A, cache)[1]
-
-
-def _render(
-    model: PersistModel,
-    params: Params,
-    x: Array,
-    times_BT: Array,
-    features: Array,
-    action_A: Array,
-    cache: FrameCache,
-) -> tuple[Array, FrameCache]:
-    config, noise = model.backbone.renderer, model.noise
-    inputs, network_times = noise.precondition(x, times_BT)
-    return voxel_renderer.apply(
-        config,
-        params["renderer"],
-        inputs.astype(jnp.dtype(model.dtype)),
-        network_times,
-        features,
-        actions_BTA=action_A[None, None] if config.actions else None,
-        cache=cache,
-    )  # type: ignore[return-value]
+    return render(*noisy_context(model.noise, latents_hwC[None, None], key))[1]
 
 
 def begin(
@@ -217,9 +204,8 @@ def begin(
     classes = jnp.where(before >= 0, before, made)  # a known grid is not changed by its picture
     everything = grid_state.write_window(grid.classes_XYZ, classes, start)
     seen = features(model, params, classes, grid.low_3, start, camera)
-    pictures = add_picture(
-        model, params, latents, seen, history.action_A, history.pictures, picture_key
-    )
+    render = renderer(model, params, seen, history.action_A, history.pictures)
+    pictures = add_picture(model, render, latents, picture_key)
     history = dataclasses.replace(history, pictures=pictures)
     return Past(ClassGrid(everything, grid.low_3, history), shown)
 
@@ -262,13 +248,14 @@ def step(
     )
     camera = made if known.camera is None else camera
     seen = features(model, params, classes, grid.low_3, start, camera)
+    render = renderer(model, params, seen, action_A, history.pictures)
     if known.rgb_HWC is None:
-        latents = sample(model, params, seen, action_A, history.pictures, keys[2])
+        latents = sample(model, render, keys[2])
         rgb, depth = decode_picture(model, params, latents)
     else:
         rgb, depth = known.rgb_HWC, known.depth_HW
         latents = encode_picture(model, params, rgb, depth)
-    pictures = add_picture(model, params, latents, seen, action_A, history.pictures, keys[3])
+    pictures = add_picture(model, render, latents, keys[3])
     history = dataclasses.replace(
         now, voxels=cache, cameras=cameras, pictures=pictures, start_3=start
     )
