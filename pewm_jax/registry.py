@@ -88,8 +88,8 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "actions": "pewm_jax.controls.actions:ModulationConfig",
     },
     "encoder": {
-        "patch_colours": "pewm_jax.encoders.patch_colours:PatchColoursConfig",
-        "latents": "pewm_jax.encoders.latents:LatentsConfig",
+        "patch_colours": "pewm_jax.encoders.simple:PatchColoursConfig",
+        "latents": "pewm_jax.encoders.simple:LatentsConfig",
         "dinov2": "pewm_jax.models.dinov2.encoder:DINOv2EncoderConfig",
     },
     "reader": {

@@ -28,7 +28,7 @@ from pewm_jax.config import Encoder, UserError
 from pewm_jax.data import dataset
 from pewm_jax.data.dataset import EpisodeSource, Manifest, read_manifest, write_json
 from pewm_jax.data.episodes import Episode
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.io import tensor_files, tree, weights
 from pewm_jax.io.progress import Meter
 from pewm_jax.models.dinov2 import model as dinov2

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 
 from pewm_jax.config import Config, Memory, Reader, UserError
-from pewm_jax.encoders.latents import LatentsConfig
+from pewm_jax.encoders.simple import LatentsConfig
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.points import PointsConfig

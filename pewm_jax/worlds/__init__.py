@@ -35,8 +35,8 @@ from jax.sharding import PartitionSpec
 from pewm_jax.config import Config, Task, UserError, World
 from pewm_jax.config.world import require_capabilities
 from pewm_jax.types import Array, Frames, Params, WorldState
-from pewm_jax.worlds import checks, forms
-from pewm_jax.worlds.stages import Stage
+from pewm_jax.worlds import checks
+from pewm_jax.worlds.stages import Stage, in_world_form, with_dictionaries
 
 
 def model_of(config: Any) -> Any:
@@ -213,7 +213,7 @@ def _start(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    state = model.start(forms.in_world_form(model, params), checks.in_metres(frames, depth_scale))
+    state = model.start(in_world_form(model, params), checks.in_metres(frames, depth_scale))
     name = "observe" if type(model).start is World.start else "start"
     return checks.returned_state(model, name, state, (1, *frames.depth_THW.shape[1:]))
 
@@ -226,7 +226,7 @@ def _observe(
     frames: Frames,
     depth_scale: Array | None,
 ) -> WorldState:
-    own, frames = forms.in_world_form(model, params), checks.in_metres(frames, depth_scale)
+    own, frames = in_world_form(model, params), checks.in_metres(frames, depth_scale)
     after = model.observe(own, state, frames)
     after = checks.returned_state(model, "observe", after, (1, *frames.depth_THW.shape[1:]))
     ok = checks.valid((), state.frame.camera)
@@ -247,7 +247,7 @@ def _imagine(
     memory: bool,
 ) -> tuple[WorldState, Frames]:
     """Imagine; without ``remember`` the state has no memory: the caller's is not copied."""
-    own = forms.in_world_form(model, params)
+    own = in_world_form(model, params)
     found = model.imagine(own, state, control, key, remember=remember, memory=memory)
     present, count = state.frame.depth_THW.shape, checks.steps_of(control)
     after, frames = checks.returned_frames(model, "imagine", found, present, count)
@@ -270,7 +270,7 @@ def _imagine_many(
 ) -> tuple[Frames, Frames]:
     """Return (K, 1) present frames, and (K, n) imagined ones or the last of them."""
     shown = {} if views is None else {"views": views}
-    own = forms.in_world_form(model, params)
+    own = in_world_form(model, params)
     size, count = state.frame.depth_THW.shape, checks.steps_of(controls, 1)
     if type(model).imagine_many is World.imagine_many:  # refuse a wrong ``imagine`` by its name
         imagine_one = functools.partial(model.imagine, remember=False, memory=memory)
@@ -295,7 +295,7 @@ def views(model: Config | Task, params: Params, state: WorldState) -> Callable[[
     It runs on the host, not under jit, for candidates of this state; None if they share no views.
     """
     model = require_world(model_of(model), "views()")
-    return model.views(forms.in_world_form(model, params), state)
+    return model.views(in_world_form(model, params), state)
 
 
 def init(model: Any, key: Array) -> Params:
@@ -306,7 +306,7 @@ def init(model: Any, key: Array) -> Params:
 def stages(model: Any) -> tuple[Stage, ...]:
     """Return the stages of a world's training, in order."""
     model = model_of(model)
-    return tuple(forms.with_dictionaries(model, stage) for stage in model.stages())
+    return tuple(with_dictionaries(model, stage) for stage in model.stages())
 
 
 def sharding(model: Any) -> tuple[tuple[str, Any], ...]:
@@ -330,7 +330,7 @@ def memory_points(
 def erase(model: Config | Task, params: Params, state: WorldState, box_23: Array) -> WorldState:
     """Return a world without the content of a box; see ``World.erase``."""
     model = require_world(model_of(model), "erase()")
-    return model.erase(forms.in_world_form(model, params), state, box_23)
+    return model.erase(in_world_form(model, params), state, box_23)
 
 
 def move(
@@ -344,7 +344,7 @@ def move(
 ) -> WorldState:
     """Return a world whose content of a box is moved; see ``World.move``."""
     model = require_world(model_of(model), "move()")
-    return model.move(forms.in_world_form(model, params), state, box_23, transform, leave=leave)
+    return model.move(in_world_form(model, params), state, box_23, transform, leave=leave)
 
 
 def coverage(
@@ -352,4 +352,4 @@ def coverage(
 ) -> dict[str, Array]:
     """Return how many pixels seen before the memory holds; see ``World.coverage``."""
     model = require_world(model_of(model), "coverage()")
-    return model.coverage(forms.in_world_form(model, params), state, frames, seen_THW)
+    return model.coverage(in_world_form(model, params), state, frames, seen_THW)

@@ -31,8 +31,7 @@ from pewm_jax.config.overlay import overlay
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
-from pewm_jax.encoders.latents import LatentsConfig
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import LatentsConfig, PatchColoursConfig
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.voxel_map import VoxelConfig

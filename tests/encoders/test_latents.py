@@ -17,8 +17,7 @@ from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import Config, ConfigError, DataConfig, UserError
 from pewm_jax.convert import stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.encoders.latents import LatentsConfig
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import LatentsConfig, PatchColoursConfig
 from pewm_jax.io import tree
 from pewm_jax.memory import feature_cache
 from pewm_jax.memory import interface as memories

@@ -10,7 +10,7 @@ from pewm_jax.cli import main as program
 from pewm_jax.codecs import signals
 from pewm_jax.config import UserError, save
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.io import weights
 from pewm_jax.memory import feature_cache
 from pewm_jax.memory import feature_cache as feature_build

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import UserError
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.memory import surfels, voxel_map
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.memory.surfels import SurfelConfig

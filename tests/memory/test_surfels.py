@@ -15,7 +15,7 @@ from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ConfigError
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.eval.seen import seen_masks
 from pewm_jax.memory import interface as memories
 from pewm_jax.memory import rendering, surfels

@@ -10,7 +10,7 @@ from typing import Literal
 
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import ClipConfig, Config, DataConfig, MeshConfig, StageConfig, TrainConfig
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec

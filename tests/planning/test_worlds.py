@@ -13,7 +13,7 @@ from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.navigation import is_free, navigable, sample_free
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.geometry.actions import discrete_table, rotation_z
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.memory.surfels import SurfelConfig

@@ -9,7 +9,7 @@ import pytest
 
 from pewm_jax.config import ClipConfig, ConfigError, UserError
 from pewm_jax.data import loader
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.memory import feature_cache
 from pewm_jax.memory import feature_cache as feature_build
 from pewm_jax.train import loading, loop, runs, stages

@@ -19,7 +19,7 @@ from pewm_jax import presets
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import ConfigError
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.io import tree, weights
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.memory.none import NoMemoryConfig

@@ -12,7 +12,7 @@ from pewm_jax.config.experiment import Config
 from pewm_jax.config.parts import Codec, Encoder, Noise
 from pewm_jax.config.training import DataConfig, EvalConfig, MeshConfig, StageConfig, TrainConfig
 from pewm_jax.config.world import ClipConfig
-from pewm_jax.encoders.patch_colours import PatchColoursConfig
+from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.attention import AttentionConfig

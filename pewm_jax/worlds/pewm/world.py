@@ -2,6 +2,11 @@
 
 Each clip is conditioned on the present frame, the control, and the memory's readout for its
 cameras. Imagined frames are inserted as observed ones are, with ``observed=False``.
+
+Stage ``gate`` fine-tunes the codec's gate, which blends imagined frames with the rendered memory.
+The codec trains it on true latents with noise, but the errors of imagined frames differ: they are
+sharp, plausible and displaced. So the model imagines each clip once, from the clip's first frame
+and with the memory of its context, and only the gate is trained to choose at each pixel.
 """
 
 from __future__ import annotations
@@ -14,16 +19,85 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
-from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, register
+from pewm_jax.codecs.signals import as_signal, rgbd_signal
+from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError, register
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
-from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, View, WorldState
+from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params, View, WorldState
 from pewm_jax.worlds import checks, objective, world_model
+from pewm_jax.worlds import codec as codec_task
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.pewm import candidates
-from pewm_jax.worlds.pewm import gate as pewm_gate
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
+
+
+def require_gate(model: AssembledModel) -> None:
+    """Refuse a model whose codec has no gate, or whose memory shows no colours."""
+    if not memories.gated(model):
+        raise UserError(
+            "train.gate.steps is above 0, but this model has no gate that mixes its memory's "
+            "colours in: give it a codec with a gate (codec.kind learned, codec.gate) and a memory "
+            "of colours, or set train.gate.steps 0."
+        )
+
+
+def prepare_gate(model: AssembledModel, params: Params, clip: Clip) -> Clip:
+    """Imagine a batch of clips with their memories; ``latents_thwC`` are those imagined.
+
+    The noise depends on the clips alone.
+
+    Raises:
+        UserError: see ``require_gate``.
+    """
+    require_gate(model)
+    readout = objective.clip_readout(model, params, clip, pictures=True)
+    frames = as_signal(clip.frames)
+    observed = jax.tree.map(lambda x: x[:, :1], frames)
+    control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
+    conditioning = world_model.condition(model, params, observed, control)
+    key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
+    shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
+    noise = jax.random.normal(key, shape)
+    latents = world_model.sample(
+        model, params, conditioning, readout, noise, jax.random.fold_in(key, 1)
+    )
+    return clip.without_context().with_extras(
+        context_features_ShwF=None, latents_thwC=latents, readout=readout
+    )
+
+
+def gate_loss(
+    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss of the gate on imagined frames; see ``codec_task.score``."""
+    assert isinstance(train, TrainConfig)
+    del key
+    if "latents_thwC" not in clip.extras:
+        clip = jax.lax.stop_gradient(prepare_gate(model, params, clip))
+    view = clip.extras["readout"].view
+    assert view is not None
+    rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
+    shown = rgbd_signal(model.clip, view.features_THWF[..., :3], view.depth_THW)
+    truth = jax.tree.map(lambda x: x[:, 1:], as_signal(clip.frames))
+    return codec_task.score(
+        model,
+        params["codec"]["gate"],
+        rgb[:, 1:],
+        depth[:, 1:],
+        shown[:, 1:],
+        view.seen_THW[:, 1:],
+        truth,
+        (train.gate_lpips, params["lpips"]) if train.gate_lpips else None,
+    )
+
+
+def gate_perceptual(model: AssembledModel, train: TrainSettings) -> Params | None:
+    """Return the weights that ``gate_loss`` needs, or None; see ``codec_task.lpips_weights``."""
+    assert isinstance(train, TrainConfig)
+    if not train.gate_lpips:
+        return None
+    return codec_task.lpips_weights(codec_task.LPIPS, model.clip)
+
 
 FROZEN = r"(codec|encoder|image|text)/.*"
 STAGE_1 = Stage(
@@ -58,13 +132,13 @@ GATE = Stage(
         (r"(backbone|control|memory|codec|encoder|image|text)/.*", FREEZE),
     ),
     init=world_model.init,
-    loss=pewm_gate.loss,
+    loss=gate_loss,
     memory=True,
-    prepare=pewm_gate.prepare,
+    prepare=prepare_gate,
     prepares_by=("backbone", "control", "memory", "codec", "encoder", "image", "text"),
     optional=True,
-    extra_weights=pewm_gate.perceptual,
-    require=pewm_gate.require_gate,
+    extra_weights=gate_perceptual,
+    require=require_gate,
 )
 STAGES = (STAGE_1, STAGE_2, JOINT, GATE)
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
