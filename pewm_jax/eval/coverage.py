@@ -37,7 +37,7 @@ def score_coverage(
 
     Returns:
         Shares of the pixels seen before: ``held``, ``chosen``, ``attended``, ``rendered``,
-        ``looked_at`` (see ``memory.coverage.Coverage``); None if no pixel was seen before.
+        ``looked_at`` (see ``memory.coverage.coverage``); None if no pixel was seen before.
 
     Raises:
         UserError: as for ``scoring.score_table``.

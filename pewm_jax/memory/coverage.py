@@ -7,7 +7,6 @@ memory is rendered, if the rendering shows that place.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 
 import jax
@@ -24,30 +23,6 @@ from pewm_jax.readers.geometry import group_latents, sightings
 from pewm_jax.types import Array, Camera, Frames, MapTokens
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Coverage:
-    """Numbers of pixels, () int32 each; divide by ``seen`` after adding up clips.
-
-    Attributes:
-        seen: pixels seen before, with a depth.
-        held: of these, pixels whose place the memory holds.
-        chosen: pixels whose place is among the clip's tokens.
-        attended: pixels whose place is among the tokens that the frame's camera attends to; equal
-            to ``chosen`` with positions that depend on no camera.
-        rendered: pixels where the rendered memory's depth agrees with the true one.
-        looked_at: what the memory's reader reads of these: ``attended`` where it reads tokens,
-            ``rendered`` where it reads pictures, either where it reads both.
-    """
-
-    seen: Array
-    held: Array
-    chosen: Array
-    attended: Array
-    rendered: Array
-    looked_at: Array
-
-
 def coverage(
     model: AssembledModel,
     memory: memories.Memory,
@@ -55,13 +30,20 @@ def coverage(
     frames: Frames,
     seen_THW: Array,
     reader: AttentionConfig | None = None,
-) -> Coverage:
+) -> dict[str, Array]:
     """Count the pixels seen before that are remembered, chosen, attended to and rendered.
 
     A place is a cell of the memory's grid; for surfels, whose cells are about as small as pixels,
     that cell or one beside it. ``frames`` are T true frames of the clip, ``tokens`` the clip's
-    (``Memory.read``). The reader is by default the memory's; with one that is not attention all
-    chosen tokens count as attended to.
+    (``Memory.read``). The reader is by default the memory's.
+
+    Returns:
+        () int32 numbers of pixels by name; divide by ``seen`` after adding up clips. ``seen``:
+        pixels seen before, with a depth; of these, ``held``: pixels whose place the memory holds;
+        ``chosen``: whose place is among the clip's tokens; ``attended``: among the tokens that the
+        frame's camera attends to, equal to ``chosen`` with positions that depend on no camera;
+        ``rendered``: where the rendered memory's depth agrees with the true one; ``looked_at``:
+        what the memory's reader reads, ``attended``, ``rendered`` or either.
     """
     depth = jnp.asarray(frames.depth_THW)
     _, height, width = depth.shape
@@ -94,8 +76,15 @@ def coverage(
     held = among(pixel_THW, points, valid)
     kind = model.memory.reader
     read = (attended & kind.READS_TOKENS) | (agrees & kind.READS_VIEW)
-    counted = (jnp.ones_like(seen), held, chosen, attended, agrees, read)
-    return Coverage(*map(count, counted))
+    masks = {
+        "seen": jnp.ones_like(seen),
+        "held": held,
+        "chosen": chosen,
+        "attended": attended,
+        "rendered": agrees,
+        "looked_at": read,
+    }
+    return {name: count(mask) for name, mask in masks.items()}
 
 
 def _among(config: Memory, cell: Array, cell_V: Array, valid_V: Array, reach: int) -> Array:

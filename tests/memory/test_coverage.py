@@ -25,13 +25,13 @@ def test_what_is_looked_at_is_chosen_and_what_is_chosen_is_held(kind):
     tokens = model.memory.read(model, memory, first.camera)
     mask = np.ones(first.depth_THW.shape, bool)
     count = jax.jit(coverage.coverage, static_argnums=0)
-    found = {k: int(v) for k, v in vars(count(model, memory, tokens, first, mask)).items()}
+    found = {k: int(v) for k, v in count(model, memory, tokens, first, mask).items()}
     assert found["seen"] == int((np.asarray(first.depth_THW) > 0).sum())
     assert found["attended"] <= found["chosen"] <= found["held"] <= found["seen"]
     assert found["looked_at"] == found["attended"]
     drawn = dataclasses.replace(model.memory, reader=RenderConfig(picture_width=8))
     again = count(dataclasses.replace(model, memory=drawn), memory, tokens, first, mask)
-    assert int(again.looked_at) == int(again.rendered)
+    assert int(again["looked_at"]) == int(again["rendered"])
     assert (found["held"] > 0) == (kind != "none")
     assert (found["chosen"] > 0) == (kind != "none")
 

@@ -19,10 +19,22 @@ from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
 from pewm_jax.types import Array, Camera, Clip, Params
-from pewm_jax.worlds.persist import losses
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist.config import PersistModel
 from pewm_jax.worlds.persist.step import draw_latents
+
+
+def leading_actions(actions_BTA: Array) -> Array:
+    """Turn (B, T − 1, A) actions that lead away from frames into (B, T, A) that lead to them."""
+    return jnp.pad(jnp.asarray(actions_BTA), ((0, 0), (1, 0), (0, 0)))
+
+
+def previous_frames(frames: Any) -> Any:
+    """Return for each frame of (B, T, …) arrays the value of the frame before.
+
+    The first frame keeps its own, from which a world can begin (w₀ from o₀).
+    """
+    return jax.tree.map(lambda x: jnp.concatenate([x[:, :1], x[:, :-1]], 1), frames)
 
 
 def lattice(model: PersistModel, clip: Clip) -> tuple[Array, Array]:
@@ -118,7 +130,7 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
         "latents": latents.astype(jnp.float16),
         "told": channels.astype(jnp.float16),
         "camera": camera,
-        "actions": losses.leading_actions(clip.actions_TA),
+        "actions": leading_actions(clip.actions_TA),
         "known": known,
         "occupied": occupied(model, classes),
         "classes": classes,
@@ -143,7 +155,7 @@ def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     place, origin = camera.world_from_camera[..., :3, 3], jnp.asarray(clip.extras["origin_T3"])
     cell = jnp.floor((place - origin) / size).astype(jnp.int32)
-    before = losses.previous_frames(recorded + cell)
+    before = previous_frames(recorded + cell)
     one = functools.partial(grid_state.cut_box, count=config.inner)
     classes = jnp.asarray(clip.extras["classes_TXYZ"]).astype(jnp.int16)
     inner = jax.vmap(jax.vmap(one))(classes, before - config.inner // 2 - recorded)
@@ -151,7 +163,7 @@ def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
         "classes": jnp.maximum(inner, 0),
         "middle": origin + cell * size,
         "camera": camera,
-        "actions": losses.leading_actions(clip.actions_TA),
+        "actions": leading_actions(clip.actions_TA),
     }
     return _prepared(clip, made)
 
@@ -175,7 +187,7 @@ def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
         "ids": layers.ids_L.astype(jnp.int16),
         "distance": layers.distance_L.astype(jnp.float16),
         "side": layers.side_L.astype(jnp.int8),
-        "actions": losses.leading_actions(clip.actions_TA),
+        "actions": leading_actions(clip.actions_TA),
     }
     if model.backbone.renderer.drawn:
 

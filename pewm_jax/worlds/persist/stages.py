@@ -1,7 +1,13 @@
-"""The stages of PERSIST's training and the loss of each; ``prepare.py`` prepares their batches."""
+"""The stages of PERSIST's training and the loss of each (arXiv 2603.03482).
+
+``voxel_vae`` reconstructs grids; ``world_frames`` and ``renderer`` learn the velocity of latents,
+with a time for each frame; ``camera`` learns the steps between cameras. ``prepare.py`` prepares
+their batches; all arrays have a leading axis B.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -10,16 +16,24 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.config import TrainSettings
+from pewm_jax.config.parts import Noise
+from pewm_jax.geometry.actions import camera_numbers, camera_steps_between
 from pewm_jax.geometry.march import RayHits
+from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.models.persist import nets as persist_nets
-from pewm_jax.models.persist import voxel_vae
+from pewm_jax.models.persist.config import VoxelVAEConfig
+from pewm_jax.nn.tokens import patchify
 from pewm_jax.types import Array, Clip, Params
-from pewm_jax.worlds.persist import losses, prepare
+from pewm_jax.worlds.persist import prepare
 from pewm_jax.worlds.persist.config import PersistModel, PersistTrainConfig
+from pewm_jax.worlds.persist.prepare import previous_frames
 from pewm_jax.worlds.persist.step import reckoned_steps
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 Measured = dict[str, Array]
+Compare = Callable[[Array, Array, Array], tuple[Array, Array]]
+"""``(x0_BTxyzC, weight_BTxyz, key) -> (error, right)``: a further error of the prediction, () and
+already weighted, and the share of correct classes; see ``class_error``."""
 STATISTICS = r"voxel_vae/latent_(mean|scale)_C"
 SMALL = 1e-4
 """The least scale of a latent."""
@@ -74,76 +88,194 @@ def distribute(
 def world_frames(
     model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
-    """Return the loss of stage ``world_frames``."""
+    """Return the loss of stage ``world_frames``: the squared error of the velocity of latents.
+
+    A frame is conditioned on the image and the camera of the frame before. Unknown latents are
+    noise at any time; later frames do not read them, and their error does not count.
+    """
     assert isinstance(train, PersistTrainConfig)
     made = _prepared(prepare.frames, model, params, clip)
-    config = model.backbone.world_frames
+    config, known = model.backbone.world_frames, made["known"]
+    latents, pixels = made["latents"].astype(jnp.float32), made["told"].astype(jnp.float32)
+    weight = 1 + (train.occupied - 1) * made["occupied"]
+    velocity_key, shown_key = jax.random.split(key)
+    shown = jax.random.uniform(shown_key, latents.shape[:2]) >= train.blind
+    predict = functools.partial(
+        voxel_dit.apply,
+        config,
+        params["voxel_dit"],
+        actions_BTA=made["actions"],
+        pixels_BThwC=previous_frames(pixels),
+        camera_BTN=previous_frames(made["camera"]) if config.camera_numbers else None,
+        shown_BT=shown | (jnp.arange(latents.shape[1]) == 0) if train.blind else None,
+        known_BTxyz=known,
+    )
 
     def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
-        vae, cells = model.backbone.voxel_vae, made["classes"]
-        frozen = params["voxel_vae"]
-        error, right = losses.class_error(vae, frozen, x0, cells, weight, train.compared, key)
+        vae, frozen = model.backbone.voxel_vae, params["voxel_vae"]
+        error, right = class_error(vae, frozen, x0, made["classes"], weight, train.compared, key)
         return train.classes * error, right
 
-    return losses.world_frames(
-        config,
-        model.voxel_noise,  # type: ignore[arg-type]
-        params["voxel_dit"],
-        made["latents"].astype(jnp.float32),
-        made["actions"],
-        made["told"].astype(jnp.float32),
-        key,
-        camera_BTN=made["camera"] if config.camera_numbers else None,
-        blind=train.blind,
-        known_BTxyz=made["known"],
-        weight_BTxyz=1 + (train.occupied - 1) * made["occupied"],
+    return _velocity(
+        model.voxel_noise,
+        lambda x, t: predict(x, t)[0],
+        latents,
+        velocity_key,
+        jnp.dtype(model.dtype),
+        known=known,
+        counts=weight,
         compare=compare if train.classes else None,
-        dtype=jnp.dtype(model.dtype),
     )
 
 
 def camera(
     model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
-    """Return the loss of stage ``camera``."""
+    """Return the loss of stage ``camera``: the squared error of steps, in the network's units.
+
+    The position of a grid tells where the agent has gone. A camera's position is therefore relative
+    to the middle of its own frame's grid, not of the grid that the step leads to. ``metres_off``
+    and ``radians_off`` are mean lengths of the errors.
+    """
     del train, key
     made = _prepared(prepare.cameras, model, params, clip)
-    return losses.camera(
-        model.backbone.camera_model,
-        params["camera_model"],
-        made["classes"].astype(jnp.int32),
-        made["middle"],
-        made["camera"],
-        made["actions"],
-        model.clip.width,
-        reckoned_BT6=reckoned_steps(model, made["actions"]),
-        dtype=jnp.dtype(model.dtype),
+    config, width = model.backbone.camera_model, model.clip.width
+    classes, actions = made["classes"].astype(jnp.int32), made["actions"]
+    reckoned = reckoned_steps(model, actions)
+    before, after = (
+        jax.tree.map(lambda x, c=c: x[:, c], made["camera"]) for c in (slice(-1), slice(1, None))
     )
+    seen = camera_numbers(before, width, made["middle"][:, :-1])
+    weights, dtype = params["camera_model"], jnp.dtype(model.dtype)
+    steps, _ = camera_model.apply(
+        config, weights, classes[:, 1:], seen, actions[:, 1:], dtype=dtype
+    )
+    off = steps + reckoned[:, 1:] - camera_steps_between(before, after, width)
+    measured = {
+        "metres_off": jnp.linalg.norm(off[..., :3], axis=-1).mean(),
+        "radians_off": jnp.linalg.norm(off[..., 3:5], axis=-1).mean(),
+    }
+    return jnp.square(off / jnp.asarray(config.units)).mean(), measured
 
 
 def renderer(
     model: PersistModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, Measured]:
-    """Return the loss of stage ``renderer``."""
+    """Return the loss of stage ``renderer``: the squared error of the velocity of latents."""
     del train
     made = _prepared(prepare.layers, model, params, clip)
-    config = model.backbone.renderer
+    config, weights = model.backbone.renderer, params["renderer"]
     layers = RayHits(
         made["ids"].astype(jnp.int32),
         made["distance"].astype(jnp.float32),
         made["side"].astype(jnp.int32),
     )
-    return losses.renderer(
-        config,
-        model.noise,  # type: ignore[arg-type]
-        params["renderer"],
-        made["latents"].astype(jnp.float32),
-        layers,
-        key,
-        actions_BTA=made["actions"] if config.actions else None,
-        drawn_BThwC=made["drawn"].astype(jnp.float32) if config.drawn else None,
-        dtype=jnp.dtype(model.dtype),
+    latents, dtype = made["latents"].astype(jnp.float32), jnp.dtype(model.dtype)
+    drawn = made["drawn"].astype(jnp.float32) if config.drawn else None
+    actions = made["actions"] if config.actions else None
+    seen = voxel_renderer.features(config, weights, layers, dtype, drawn_hwC=drawn)
+    predict = functools.partial(
+        voxel_renderer.apply, config, weights, features_BThwF=seen, actions_BTA=actions
     )
+    return _velocity(model.noise, lambda x, t: predict(x, t)[0], latents, key, dtype)
+
+
+def _velocity(
+    noise: Any,
+    predict: Callable[[Array, Array], Array],
+    x0: Array,
+    key: Array,
+    dtype: Any,
+    *,
+    known: Array | None = None,
+    counts: Array | None = None,
+    compare: Compare | None = None,
+) -> tuple[Array, Measured]:
+    """Return the squared error of velocities and of x0, at times drawn for each frame."""
+    time_key, noise_key = jax.random.split(key)
+    times = noise.draw(time_key, *x0.shape[:2])
+    times = jnp.broadcast_to(times if times.ndim == 2 else times[:, None], x0.shape[:2])
+    drawn = jax.random.normal(noise_key, x0.shape)
+    x_t = noise.corrupt(x0, drawn, times)
+    if known is not None:
+        x_t = jnp.where(known[..., None], x_t, drawn)
+    inputs, network_times = noise.precondition(x_t, times)
+    made = predict(inputs.astype(dtype), network_times).astype(jnp.float32)
+    error = jnp.square(made - noise.prediction_target(x0, drawn, times))
+    weight = Noise.expand(noise.weight(times), error.ndim)
+    made_x0 = noise.to_x0(made, x_t, times)
+    x0_error = jnp.square(made_x0 - x0)
+
+    share = jnp.ones(x0.shape[:-1]) if known is None else known.astype(jnp.float32)
+
+    def mean(x: Array, share: Array) -> Array:
+        return (x * (share / jnp.maximum(share.mean(), 1e-6))[..., None]).mean()
+
+    counted = share if counts is None else share * counts
+    loss, measured = mean(error * weight, counted), {"x0_error": mean(x0_error, share)}
+    if compare is None:
+        return loss, measured
+    compared, right = compare(made_x0, counted, jax.random.fold_in(key, 2))
+    return loss + compared, measured | {"classes": compared, "classes_right": right}
+
+
+def class_error(
+    config: VoxelVAEConfig,
+    params: Params,
+    latents_BTxyzC: Array,
+    classes_BTXYZ: Array,
+    weight_BTxyz: Array,
+    count: int,
+    key: Array,
+) -> tuple[Array, Array]:
+    """Return the cross-entropy of the cells of ``count`` latents per frame, drawn by their weight.
+
+    ``config`` is an autoencoder that ``PersistTrainConfig.classes`` accepts; latents are
+    normalised; class ids are below 0 if unknown; latents of weight 0 are never drawn.
+
+    Returns:
+        ``(error, right)``: () nats per cell, () the share of cells whose class is the likeliest.
+    """
+    frames, side = latents_BTxyzC.shape[0] * latents_BTxyzC.shape[1], config.latent_side
+    flat = latents_BTxyzC.reshape(frames, side**3, -1)
+    weight = weight_BTxyz.reshape(frames, -1).astype(jnp.float32)
+    cells = cells_of_latents(config, classes_BTXYZ.reshape(frames, *classes_BTXYZ.shape[2:]))
+    drawn = voxel_vae.sample_cells(weight, count, key)[..., None]
+    error, right = latent_class_error(
+        config,
+        params,
+        jnp.take_along_axis(flat, drawn, 1).reshape(frames * count, -1),
+        jnp.take_along_axis(cells, drawn, 1).reshape(frames * count, -1),
+    )
+    # Latents drawn from an unknown frame do not count.
+    counts = jnp.repeat((weight.sum(1) > 0).astype(jnp.float32), count)
+    share = counts / jnp.maximum(counts.sum(), 1)
+    return (error * share).sum(), (right * share).sum()
+
+
+def cells_of_latents(config: VoxelVAEConfig, classes_BXYZ: Array) -> Array:
+    """Return (B, latents, cells of one), a latent's cells in the order X, Y, Z."""
+    return patchify(classes_BXYZ[..., None], config.factor, config.factor)
+
+
+def latent_class_error(
+    config: VoxelVAEConfig, params: Params, latents_NC: Array, classes_NK: Array
+) -> tuple[Array, Array]:
+    """Return the cross-entropy of the cells of normalised latents, each decoded alone.
+
+    Returns:
+        ``(error_N, right_N)``: the mean over the known cells of a latent (ids ≥ 0), in nats, and
+        the share of them whose class is the likeliest.
+    """
+    alone = dataclasses.replace(config, side=config.factor, cube=0, slab=0)
+    scores = voxel_vae.logits(alone, params, latents_NC[:, None, None, None])
+    scores = scores.reshape(*classes_NK.shape, -1).astype(jnp.float32)
+    ids = jnp.maximum(classes_NK, 0).astype(jnp.int32)
+    chosen = jnp.take_along_axis(scores, ids[..., None], -1)[..., 0]
+    known = (classes_NK >= 0).astype(jnp.float32)
+    share = known / jnp.maximum(known.sum(1, keepdims=True), 1)
+    missed, right = jax.nn.logsumexp(scores, -1) - chosen, chosen >= scores.max(-1)
+    return (missed * share).sum(1), (right * share).sum(1)
 
 
 def _stage(

@@ -323,4 +323,4 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         """Count the pixels that the memory covers; see ``memory.coverage``."""
         del params
         tokens = self.memory.read(self, state.map, frames.camera)
-        return vars(memory_coverage.coverage(self, state.map, tokens, frames, seen_THW))
+        return memory_coverage.coverage(self, state.map, tokens, frames, seen_THW)

@@ -11,7 +11,7 @@ from pewm_jax.config import ConfigError
 from pewm_jax.models.persist import voxel_vae
 from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.presets import persist_tiny
-from pewm_jax.worlds.persist import losses as persist_classes
+from pewm_jax.worlds.persist import stages as persist_classes
 from tests.models.persist.networks import normal, weights
 
 VAE = VoxelVAEConfig(

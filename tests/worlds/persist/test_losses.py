@@ -20,12 +20,28 @@ from pewm_jax.models.persist.config import (
     VoxelVAEConfig,
 )
 from pewm_jax.types import Camera
-from pewm_jax.worlds.persist import losses as persist_losses
-from pewm_jax.worlds.persist import stages
+from pewm_jax.worlds.persist import prepare, stages
+from pewm_jax.worlds.persist.config import PersistTrainConfig
 from tests.models.persist.networks import normal, weights
 
 BLOCKS = BlocksConfig(layers=1, heads=2, head_dim=8, mlp_ratio=2, context=3)
 NOISE = PERSIST_VOXELS
+
+
+def model_of(**networks):
+    """The settings that a stage's loss reads, with these networks."""
+    return SimpleNamespace(
+        backbone=SimpleNamespace(**networks),
+        noise=NOISE,
+        voxel_noise=NOISE,
+        dtype="float32",
+        clip=SimpleNamespace(width=32),
+        dead_reckoning=False,
+    )
+
+
+def prepared(**arrays):
+    return SimpleNamespace(extras={"prepared": arrays})
 
 
 def walk(seed, frames=4):
@@ -40,9 +56,9 @@ def walk(seed, frames=4):
 
 def test_actions_lead_to_their_frame_and_pictures_are_those_before():
     recorded = np.arange(1, 7, dtype=np.float32).reshape(1, 3, 2)
-    led = persist_losses.leading_actions(recorded)
+    led = prepare.leading_actions(recorded)
     np.testing.assert_array_equal(led[0], [[0, 0], [1, 2], [3, 4], [5, 6]])
-    shown = persist_losses.previous_frames({"a": np.arange(4)[None]})
+    shown = prepare.previous_frames({"a": np.arange(4)[None]})
     np.testing.assert_array_equal(shown["a"][0], [0, 0, 1, 2])
 
 
@@ -54,7 +70,7 @@ def test_whoever_knows_the_answer_has_no_error():
         asked.append(times.shape)
         return NOISE.velocity(x0, x_t, times / NOISE.scale)
 
-    loss, measured = persist_losses._velocity(NOISE, predict, x0, jax.random.key(0), jnp.float32)
+    loss, measured = stages._velocity(NOISE, predict, x0, jax.random.key(0), jnp.float32)
     assert loss < 1e-4
     assert measured["x0_error"] < 1e-9
     assert asked == [(2, 5)]
@@ -71,10 +87,14 @@ def test_world_frames_are_shown_the_picture_before_and_learn_from_everything():
     @jax.jit
     def both(params, pixels):
         def total(params, pixels):
-            return persist_losses.world_frames(
-                config, NOISE, params, x0, actions, pixels, jax.random.key(3),
-                camera_BTN=normal(4, 2, 4, 10), blind=0.3,
+            clip = prepared(
+                latents=x0, told=pixels, actions=actions, camera=normal(4, 2, 4, 10),
+                known=np.ones(x0.shape[:-1], bool), occupied=0,
             )  # fmt: skip
+            train = PersistTrainConfig(blind=0.3)
+            return stages.world_frames(
+                model_of(world_frames=config), train, {"voxel_dit": params}, clip, jax.random.key(3)
+            )
 
         return jax.value_and_grad(total, (0, 1), has_aux=True)(params, pixels)
 
@@ -101,14 +121,19 @@ def test_the_error_counts_where_it_is_told_to():
 
     @jax.jit
     def error(counts, known):
-        return persist_losses.world_frames(
-            config, NOISE, params, x0, actions, pixels, jax.random.key(3), weight_BTxyz=counts,
-            known_BTxyz=known,
-        )[0]  # fmt: skip
+        clip = prepared(
+            latents=x0, told=pixels, actions=actions, camera=normal(4, 2, 4, 10), known=known,
+            occupied=counts - 1,
+        )  # fmt: skip
+        train = PersistTrainConfig(blind=0.0, occupied=2.0)  # counts are 1 + (2 − 1) · occupied
+        return stages.world_frames(
+            model_of(world_frames=config), train, {"voxel_dit": params}, clip, jax.random.key(3)
+        )[0]
 
     ones = np.ones(shape, bool)
     alike, here, there, more = (
-        float(error(counts, ones)) for counts in (1 + 0 * large, large, ~large, 1 + 3 * large)
+        float(error(counts, ones))
+        for counts in (1 + 0 * large, 1 * large, 1 * ~large, 1 + 3 * large)
     )
     assert 90 < here < 110
     assert there < 3
@@ -128,9 +153,14 @@ def test_the_camera_learns_steps_and_does_not_see_where_the_next_grid_lies():
 
     @jax.jit
     def run(params, middle, poses):
-        return persist_losses.camera(
-            config, params, classes, middle, Camera(seen.intrinsics_4, poses), actions, 32
+        clip = prepared(
+            classes=classes,
+            middle=middle,
+            camera=Camera(seen.intrinsics_4, poses),
+            actions=actions,
         )
+        model = model_of(camera_model=config)
+        return stages.camera(model, None, {"camera_model": params}, clip, None)
 
     loss, measured = run(silent, middle, seen.world_from_camera)
     first, second = (
@@ -164,9 +194,15 @@ def test_the_renderer_learns_to_fold_layers():
 
     @jax.jit
     def slopes(params):
-        return jax.grad(
-            lambda p: persist_losses.renderer(config, NOISE, p, x0, layers, jax.random.key(0))[0]
-        )(params)
+        def loss(params):
+            clip = prepared(
+                latents=x0, ids=layers.ids_L, distance=layers.distance_L, side=layers.side_L,
+                actions=None,
+            )  # fmt: skip
+            model = model_of(renderer=config)
+            return stages.renderer(model, None, {"renderer": params}, clip, jax.random.key(0))[0]
+
+        return jax.grad(loss)(params)
 
     found = slopes(params)
     for name in ("classes", "faces", "fold"):
@@ -177,8 +213,7 @@ def test_every_grid_of_a_clip_is_reconstructed(monkeypatch):
     config = VoxelVAEConfig(side=4, classes=3, patch=4, embed=2, widths=(4,))
     seen = []
     monkeypatch.setattr(voxel_vae, "loss", lambda *arguments: seen.append(arguments))
-    prepared = {"prepared": np.zeros((2, 3, 4, 4, 4), np.int16)}
-    model = SimpleNamespace(backbone=SimpleNamespace(voxel_vae=config), dtype="float32")
-    stages.autoencode(model, None, {"voxel_vae": {}}, SimpleNamespace(extras=prepared), None)
+    grids = SimpleNamespace(extras={"prepared": np.zeros((2, 3, 4, 4, 4), np.int16)})
+    stages.autoencode(model_of(voxel_vae=config), None, {"voxel_vae": {}}, grids, None)
     ((_, _, grids, _, _),) = seen
     assert grids.shape == (6, 4, 4, 4)
