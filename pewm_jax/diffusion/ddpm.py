@@ -205,11 +205,11 @@ class DDPMConfig(Noise):
         if step_noise is not None and step_noise.shape != shape:
             raise ValueError(f"step_noise has the shape {step_noise.shape}; it needs {shape}.")
 
-        def fresh(k: Array) -> Array:
-            if step_noise is not None:
-                return jnp.asarray(step_noise)[k]
+        def drawn(k: Array) -> Array:
+            assert key is not None
             return jax.random.normal(jax.random.fold_in(key, k), noise.shape, noise.dtype)
 
+        fresh = drawn if step_noise is None else jnp.asarray(step_noise).__getitem__
         return follow(self.steps(), denoise, noise, fresh, every_step=every_step)
 
     def alphas_cumprod(self) -> np.ndarray:

@@ -63,11 +63,12 @@ def splat(
         features = jnp.where(seen[:, None], features_VF[jnp.minimum(index, count - 1)], 0)
         return features, jnp.where(seen, depth, 0), seen
 
-    return _as_images(*jax.vmap(render)(camera), height, width)
+    return _as_images(jax.vmap(render)(camera), height, width)
 
 
-def _as_images(features: Array, depth: Array, seen: Array, height: int, width: int) -> View:
-    """Return (T, H·W, …) pixels as images."""
+def _as_images(pixels: tuple[Array, Array, Array], height: int, width: int) -> View:
+    """Return (T, H·W, …) features, depth and whether something is seen as images."""
+    features, depth, seen = pixels
     shape = (len(depth), height, width)
     return View(features.reshape(*shape, -1), depth.reshape(shape), seen.reshape(shape))
 
@@ -137,7 +138,7 @@ def splat_surfels(
         )
 
     # Frame after frame: the data of one fit a processor's cache, those of nine do not.
-    return _as_images(*jax.lax.map(one, jax.tree.map(jnp.asarray, camera)), height, width)
+    return _as_images(jax.lax.map(one, jax.tree.map(jnp.asarray, camera)), height, width)
 
 
 def splat_cells(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -147,4 +147,5 @@ def write(
         shape = trimesh.Scene({"map": shape.apply_transform(UPRIGHT)})
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(path) as partial:
-        partial.write_bytes(shape.export(file_type=kind[1:]))
+        data: Any = shape.export(file_type=kind[1:])
+        partial.write_bytes(data)

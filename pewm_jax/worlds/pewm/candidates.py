@@ -137,12 +137,14 @@ def each_camera_once(render: Any, camera: Camera) -> View:
     new = first == jnp.arange(count)
     slot = (jnp.cumsum(new) - 1)[first]
     (order,) = jnp.nonzero(new, size=count, fill_value=0)
-    pictures = _one_by_one(render, flat, new.sum(), lambda number: order[number])
+    pictures = _one_by_one(render, flat, lambda number: order[number])(new.sum())
     return jax.tree.map(lambda x: x[slot].reshape(*leading, *x.shape[1:]), pictures)
 
 
-def _one_by_one(render: Any, camera: Camera, count: Array, pick: Callable[[Array], Any]) -> View:
-    """Render ``count`` of (n,) cameras, chosen by their order, one by one; other views are 0."""
+def _one_by_one(
+    render: Any, camera: Camera, pick: Callable[[Array], Any]
+) -> Callable[[Array], View]:
+    """Return a function that renders so many of (n,) picked cameras; other views are 0."""
     like = jax.eval_shape(render, jax.tree.map(lambda x: x[:1], camera))
     room = len(camera.intrinsics_4)
     blank = jax.tree.map(lambda x: jnp.zeros((room, *x.shape[1:]), x.dtype), like)
@@ -151,7 +153,7 @@ def _one_by_one(render: Any, camera: Camera, count: Array, pick: Callable[[Array
         one = render(jax.tree.map(lambda x: x[pick(number)][None], camera))
         return jax.tree.map(lambda all_, x: all_.at[number].set(x[0]), pictures, one)
 
-    return jax.lax.fori_loop(0, count, draw, blank)
+    return lambda count: jax.lax.fori_loop(0, count, draw, blank)
 
 
 FINE = 2.0**-20
@@ -213,9 +215,8 @@ def _rounded(x: np.ndarray) -> np.ndarray:
 def _rendered(model: AssembledModel, memory: Any, camera: Camera, count: Array) -> View:
     """Render the first ``count`` of (n,) cameras; the other views are 0."""
     height, width = model.clip.height, model.clip.width
-    return _one_by_one(
-        lambda one: memories.render(model, memory, one, height, width), camera, count, lambda n: n
-    )
+    render = functools.partial(memories.render, model, memory, height=height, width=width)
+    return _one_by_one(render, camera, lambda number: number)(count)
 
 
 @functools.partial(jax.jit, static_argnums=0)
