@@ -306,7 +306,7 @@ def named(section: str, name: str) -> Kind:
         if (section, name) in _KINDS:
             return _KINDS[section, name]
     raise ConfigError(
-        f"There is no {section} of kind {name!r}; there is {', '.join(names(section))} (a kind of "
+        f"There is no {section} of kind {name!r}; the kinds are {', '.join(names(section))} (a kind of "
         "your own is known once its file is run: give the command --plugin FILE, "
         f"or name the module in an entry point of the group {GROUP!r})"
         + "".join(f"; {sentence.removesuffix('.')}" for sentence in failed)

@@ -160,7 +160,9 @@ def number_of(config: GridConfig, name: str) -> int:
     """
     table = names(config)
     if name not in table:
-        raise UserError(f"there is no class {name!r} in this world; there is {', '.join(table)}.")
+        raise UserError(
+            f"there is no class {name!r} in this world; the classes are {', '.join(table)}."
+        )
     return table.index(name)
 
 

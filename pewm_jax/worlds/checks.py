@@ -284,7 +284,7 @@ def steps_of(control: Any, leading: int = 0) -> int:
 def _check_returned(frames: Any, what: str, size: tuple[int, ...]) -> None:
     """Refuse frames of another shape, or of integers, that a world's method returned."""
     if not isinstance(frames, Frames):
-        raise UserError(f"{what} must be Frames: a {type(frames).__name__} is none.")
+        raise UserError(f"{what} must be Frames, not a {type(frames).__name__}.")
     *leading, _, _ = size
     wanted = ((*size, 3), size, (*leading, 4, 4), (*leading, 4))
     for (name, value), shape in zip(_fields(frames), wanted, strict=True):
@@ -320,7 +320,7 @@ def _check_dtypes(frames: Frames, who: str, depth_scale: float | None) -> None:
     depth = frames.depth_THW
     if depth_scale is None and jnp.issubdtype(depth.dtype, jnp.integer):
         raise UserError(
-            f"{who}() got depth as {depth.dtype} integers, whose unit is not known; say the metres "
+            f"{who}() got depth as {depth.dtype} integers, whose unit is unknown; give the metres "
             "per unit, such as depth_scale=0.001 for millimetres, or give float metres."
         )
     if depth_scale is None or isinstance(depth_scale, Tracer):
@@ -490,6 +490,6 @@ def _check_discrete(actions: Array, who: str) -> None:
     if wrong:
         known = ", ".join(f"{number} {name}" for number, name in enumerate(names))
         raise UserError(
-            f"{who}() got the discrete actions {wrong}; there is {known}, {len(names)} in all "
+            f"{who}() got the discrete actions {wrong}; the {len(names)} actions are {known} "
             "(continuous actions are floats of shape (n, 3))."
         )

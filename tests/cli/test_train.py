@@ -182,7 +182,7 @@ def test_a_file_with_wrong_settings_is_refused(taken, tmp_path, capsys, text, pa
         (["tiny", "--memory.cell_m", "1", "2"], "--model.memory.cell_m needs 3 values."),
         (
             ["tiny", "--memory.kind", "image"],
-            "There is no memory of kind 'image'; there is grid, images",
+            "There is no memory of kind 'image'; the kinds are grid, images",
         ),
         (["tiny", "--clip.frames", "8"], "clip.frames is 8: the codec folds every 4 frames"),
         (

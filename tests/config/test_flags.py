@@ -141,7 +141,7 @@ def test_another_kind_keeps_what_both_have_and_takes_settings_of_its_own():
     [
         (
             ["--memory.kind", "image"],
-            "no memory of kind 'image'; there is grid, images, map2d, .*none",
+            "no memory of kind 'image'; the kinds are grid, images, map2d, .*none",
         ),
         (["--memory.kind"], "--model.memory.kind needs a value: grid, images, map2d"),
         (["--memory.snapshots", 3], "--model.memory.snapshots is not a setting"),

@@ -207,9 +207,7 @@ def require_recorded(model: PersistModel, clip: Clip) -> None:
         f"--voxels.side {memory.recorded} {groups} --voxels.pictures {memory.pictures}"
     )
     if classes is None or clip.actions_TA is None:
-        raise UserError(
-            f"the data have no voxels or no actions, from which this world learns: {command}."
-        )
+        raise UserError(f"the data lack voxels or actions, which this world needs: run {command}.")
     if classes.shape[-1] != memory.recorded:
         raise UserError(
             f"the recorded grids have {classes.shape[-1]} cells along each axis, and memory."

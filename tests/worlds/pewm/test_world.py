@@ -222,7 +222,7 @@ CAMERA = random_camera(np.random.default_rng(0), 3)
         (0, "no actions; give at least one"),
         (np.zeros((3, 2), np.float32), "of shape (3, 2); give (3,) integers or (3, 3)"),
         (np.zeros((3,), np.float32), "of shape (3,); give"),
-        ([0, 5], "discrete actions [5]; there is 0 forward"),
+        ([0, 5], "discrete actions [5]; the 3 actions are 0 forward"),
         (jax.tree.map(lambda x: x[:0], CAMERA), "a camera for each of n ≥ 1"),
         (jax.tree.map(lambda x: x[0], CAMERA), "a camera for each of n ≥ 1"),
         (Camera(CAMERA.intrinsics_4[:2], CAMERA.world_from_camera), "a camera for each of n ≥ 1"),
