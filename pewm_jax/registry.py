@@ -306,9 +306,9 @@ def named(section: str, name: str) -> Kind:
         if (section, name) in _KINDS:
             return _KINDS[section, name]
     raise ConfigError(
-        f"There is no {section} of kind {name!r}; the kinds are {', '.join(names(section))} (a kind of "
-        "your own is known once its file is run: give the command --plugin FILE, "
-        f"or name the module in an entry point of the group {GROUP!r})"
+        f"There is no {section} of kind {name!r}; the kinds are {', '.join(names(section))} (to "
+        "use a kind of your own, give the command --plugin FILE, or name its module in an entry "
+        f"point of the group {GROUP!r})"
         + "".join(f"; {sentence.removesuffix('.')}" for sentence in failed)
         + "."
     )

@@ -160,9 +160,8 @@ def number_of(config: GridConfig, name: str) -> int:
     """
     table = names(config)
     if name not in table:
-        raise UserError(
-            f"there is no class {name!r} in this world; the classes are {', '.join(table)}."
-        )
+        known = ", ".join(table)
+        raise UserError(f"there is no class {name!r} in this world; the classes are {known}.")
     return table.index(name)
 
 

@@ -127,7 +127,5 @@ def test_lists_and_numpy_arrays_are_actions_too(params):
 
 @pytest.mark.parametrize("wrong", [3, -1])
 def test_rollout_refuses_discrete_actions_that_do_not_exist(params, wrong):
-    with pytest.raises(
-        UserError, match=rf"discrete actions \[{wrong}\]; the 3 actions are 0 forward, 1"
-    ):
+    with pytest.raises(UserError, match=rf"discrete actions \[{wrong}\]; the 3 actions are 0 f"):
         rollouts.rollout(CONFIG, params, a_state(params), [0] * 7 + [wrong], jax.random.key(0))

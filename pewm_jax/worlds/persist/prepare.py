@@ -211,7 +211,7 @@ def require_recorded(model: PersistModel, clip: Clip) -> None:
     if classes.shape[-1] != memory.recorded:
         raise UserError(
             f"the recorded grids have {classes.shape[-1]} cells along each axis, and memory."
-            f"recorded is {memory.recorded}: {command}."
+            f"recorded is {memory.recorded}: run {command}."
         )
 
 
