@@ -163,8 +163,8 @@ def require_capabilities(world: World) -> None:
     found, name = world.capabilities, type(world).__name__
     require(
         isinstance(found, Capabilities),
-        f"{name}.capabilities is a {type(found).__name__}: make it a property that returns "
-        "pewm_jax.config.Capabilities(…).",
+        f"{name}.capabilities is a {type(found).__name__}: set it to "
+        "pewm_jax.config.Capabilities(…), or make it a property that returns one.",
     )
     for capability, methods in METHODS.items():
         declared = getattr(found, capability)

@@ -88,7 +88,7 @@ class Points(Still):
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
-        (Dictionary, "Dictionary.capabilities is a dict: make it a property that returns"),
+        (Dictionary, "Dictionary.capabilities is a dict: set it to pewm_jax.config.Capabilities"),
         (Edits, "Edits.capabilities has edits=True, and Edits has no method erase and move: add"),
         (Erases, "Erases.capabilities has edits=True, and Erases has no method move: add it, or"),
         (Points, "Points has no method memory_points: add it, or set points=False."),
