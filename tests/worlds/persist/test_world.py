@@ -306,7 +306,7 @@ def test_without_its_memory_it_begins_anew_and_the_state_is_left(state, monkeypa
         went_on.append(past.grid)
         return past, jax.tree.map(lambda x: x[:1], state.frame)
 
-    monkeypatch.setattr(persist, "_from_nothing", start)
+    monkeypatch.setattr(persist, "_begin_from_frames", start)
     monkeypatch.setattr(persist, "step", step)
     with jax.disable_jit():
         for memory in (True, False):
