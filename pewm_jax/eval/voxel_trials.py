@@ -84,7 +84,7 @@ class Trials:
 def room(model: PERSIST, state: WorldState, floor_z: float) -> np.ndarray | None:
     """Return a box (2, 3), metres, of empty cells on the floor in front of the agent, or None."""
     cells = np.asarray(state.map.classes_XYZ)
-    low, size = np.asarray(state.map.low_3), windows.cell_m(model)
+    low, size = np.asarray(state.map.low_3), model.cell
     pose = np.asarray(state.frame.camera.world_from_camera)[0]
     yaw = float(heading(pose))
     for away in AHEAD_M:
@@ -240,8 +240,8 @@ def _rays_on_block(
         voxel_renderer.cast_rays(
             model.backbone.renderer,  # type: ignore[attr-defined]
             jnp.maximum(windows.window(model, one.classes_XYZ, first), 0)[None],
-            (grid.low_3 + first * windows.cell_m(model))[None],
-            windows.cell_m(model),
+            (grid.low_3 + first * model.cell)[None],
+            model.cell,
             camera,
             (model.clip.height, model.clip.width),
         )
@@ -249,8 +249,8 @@ def _rays_on_block(
     ]
     apart = [(one.ids_L[0, ..., 0], one.distance_L[0, ..., 0]) for one in both]
     (ids, depth), (other, beyond) = apart
-    low = grid.low_3 + first * windows.cell_m(model)
-    high = low + windows.side(model) * windows.cell_m(model)
+    low = grid.low_3 + first * model.cell
+    high = low + model.side * model.cell
     within = jnp.all((box_23[1] > low) & (box_23[0] < high))
     return (ids != other) | (jnp.abs(depth - beyond) > 1e-3), within
 
