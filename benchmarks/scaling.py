@@ -74,7 +74,7 @@ def row(label: str, plan: StagePlan) -> list[str]:
         label,
         str(plan.stage.number),
         f"{choice.mesh.devices} × {plan.chip.name}",
-        arranged(choice),
+        arranged(choice.mesh.sizes),
         size(choice.memory.peak),
         size(compiled.peak),
         "yes" if choice.fits else "**no**",
@@ -82,7 +82,7 @@ def row(label: str, plan: StagePlan) -> list[str]:
         duration(choice.time.step_s),
         f"{choice.time.mfu:.0%}",
         rate(choice.time.clips_per_s),
-        f"{arranged(best)}: {duration(best.time.step_s)}",
+        f"{arranged(best.mesh.sizes)}: {duration(best.time.step_s)}",
     ]
 
 

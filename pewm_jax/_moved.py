@@ -260,7 +260,7 @@ MOVED = {
     "planning.rounds_file": "planning.plan",
     "planning.tasks": "planning.house",
     "scaling.footprint": "plan.suggest",
-    "scaling.hlo": "plan.hlo",
+    "scaling.hlo": "plan.program",
     "scaling.hlo_text": "plan.hlo",
     "scaling.plan": "plan.plan",
     "scaling.plan_text": "plan.plan",

@@ -121,15 +121,8 @@ def run(chosen: Chosen, config: Config) -> None:
 def plan(chosen: Chosen, config: Config) -> None:
     """Print the predicted memory and time of a training on other hardware."""
     from pewm_jax.plan import plan as planning
-    from pewm_jax.plan import target_plan
 
-    launch = dataclasses.replace(chosen.launch, plan=True)
-    if launch.compiler == "target":
-        target_plan.show(config, launch)
-        return
-    plans = planning.show(config, launch)
-    if launch.json:
-        target_plan.write(Path(launch.json), [target_plan.estimate(plan) for plan in plans])
+    planning.show(config, dataclasses.replace(chosen.launch, plan=True))
 
 
 def _epilog(prog: str, examples: Sequence[str]) -> str:

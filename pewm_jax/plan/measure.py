@@ -7,9 +7,12 @@ jaxprs give the FLOPs (``train.flops``). The compiled program gives memory and c
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -18,7 +21,8 @@ from jax.sharding import AbstractMesh, Mesh
 
 from pewm_jax.config import AXES, Config, UserError
 from pewm_jax.data import abstract
-from pewm_jax.plan import hlo
+from pewm_jax.plan import program
+from pewm_jax.plan.program import Collective, Program
 from pewm_jax.train import flops, sharding, step
 from pewm_jax.train.chips import Chip
 from pewm_jax.train.flops import Work
@@ -58,6 +62,35 @@ class MeshSizes:
         """Return a mesh without devices."""
         return AbstractMesh(tuple(self.sizes.values()), tuple(self.sizes))
 
+    @functools.cached_property
+    def groups(self) -> dict[tuple[int, ...], str]:
+        """Return the axes along which each group of devices lies, joined by ``+``."""
+        split = [name for name, size in self.sizes.items() if size > 1]
+        places = np.arange(self.devices).reshape(tuple(self.sizes.values()))
+        found: dict[tuple[int, ...], str] = {}
+        for count in range(1, len(split) + 1):
+            for axes in itertools.combinations(split, count):
+                moved = np.moveaxis(places, [AXES.index(axis) for axis in axes], range(-count, 0))
+                rows = moved.reshape(-1, math.prod(self.sizes[axis] for axis in axes))
+                for group in np.sort(rows).tolist():
+                    found.setdefault(tuple(group), "+".join(axes))
+        return found
+
+    def axes_of(self, group: tuple[int, ...]) -> str:
+        """Return the axes along which devices communicate: all along them, or some of these."""
+        exact = self.groups.get(tuple(sorted(group)))
+        around = [axes for whole, axes in self.groups.items() if set(group) <= set(whole)]
+        if exact or len(group) != 2 or not around:  # a permutation names pairs
+            return exact or "other"
+        return min(around, key=lambda axes: axes.count("+"))
+
+    def sent(self, collectives: Iterable[Collective]) -> dict[tuple[str, str], float]:
+        """Return the bytes that a device sends, by (kind, axes of the mesh)."""
+        sent = defaultdict[tuple[str, str], float](float)
+        for item in collectives:
+            sent[item.kind, self.axes_of(item.group)] += item.sent
+        return {key: size for key, size in sorted(sent.items()) if size}
+
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
@@ -71,7 +104,7 @@ class Compiled:
         seconds: time of compilation.
     """
 
-    program: hlo.Program
+    program: Program
     arguments: float
     temporary: float
     mesh: MeshSizes
@@ -84,14 +117,11 @@ class Compiled:
 
     def sent_along(self, axis: str) -> dict[str, float]:
         """Return kind → bytes that a device sends to devices that differ only along this axis."""
-        places = np.arange(self.mesh.devices).reshape(tuple(self.mesh.sizes.values()))
-        lines = np.moveaxis(places, AXES.index(axis), -1).reshape(-1, self.mesh.sizes[axis])
-        groups = {tuple(sorted(line)) for line in lines.tolist()}
-        sent: dict[str, float] = {}
+        sent = defaultdict[str, float](float)
         for item in self.program.collectives:
-            if len(item.group) > 1 and tuple(sorted(item.group)) in groups:
-                sent[item.kind] = sent.get(item.kind, 0.0) + item.sent
-        return sent
+            if self.mesh.groups.get(tuple(sorted(item.group))) == axis:
+                sent[item.kind] += item.sent
+        return dict(sent)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,8 +172,7 @@ def virtual(count: int) -> Sequence[Any]:
     if len(devices) < count:
         raise UserError(
             f"A plan for {count} devices needs a process in which JAX has not been used, but here "
-            "it "
-            f"uses {len(devices)} already: run `python train.py … --plan`."
+            f"it uses {len(devices)} already: run `python train.py … --plan`."
         )
     return devices[:count]
 
@@ -187,7 +216,7 @@ def compile_traced(traced: jax.stages.Traced, mesh: Mesh | MeshSizes) -> Compile
         raise UserError("This JAX does not return the text of a program; use 0.10 or newer.")
     arguments, temporary = device_memory(compiled)
     return Compiled(
-        program=hlo.read(text),
+        program=program.read(text),
         arguments=arguments,
         temporary=temporary,
         mesh=MeshSizes(**{name: mesh.shape[name] for name in AXES})

@@ -15,10 +15,9 @@ import math
 from collections.abc import Iterator, Mapping
 
 import jax
-import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import AXES, Config
+from pewm_jax.config import Config
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
 from pewm_jax.plan.measure import Compiled, MeshSizes, StepWork, in_bfloat16
@@ -304,9 +303,7 @@ def _ring(devices: int) -> float:
 
 def _rate(mesh: MeshSizes, axis: str, chip: Chip) -> float:
     """Return the bytes/s at which a device sends along an axis of the mesh."""
-    places = np.arange(mesh.devices).reshape(tuple(mesh.sizes.values()))
-    group = np.moveaxis(places, AXES.index(axis), -1).reshape(-1, mesh.sizes[axis])[0]
-    return rate(tuple(group.tolist()), chip)
+    return rate(next(group for group, axes in mesh.groups.items() if axes == axis), chip)
 
 
 def rate(group: tuple[int, ...], chip: Chip) -> float:

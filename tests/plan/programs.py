@@ -16,8 +16,9 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
-from pewm_jax.plan import hlo, measure, suggest
+from pewm_jax.plan import measure, suggest
 from pewm_jax.plan.measure import MeshSizes
+from pewm_jax.plan.program import COLLECTIVES
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.both import BothConfig
 from pewm_jax.worlds.pewm.world import PEWM, STAGES
@@ -99,9 +100,10 @@ def compare(number, settings, devices):
     return {
         "flops": compiled.program.flops,
         "flops_expected": sum(work.on_device(mesh).values()),
-        "sent": {kind: compiled.program.sent(kind) for kind in hlo.KINDS},
+        "sent": {kind: compiled.program.sent(kind) for kind in COLLECTIVES},
         "sent_expected": {
-            kind: sum(size for (one, _), size in sent.items() if one == kind) for kind in hlo.KINDS
+            kind: sum(size for (one, _), size in sent.items() if one == kind)
+            for kind in COLLECTIVES
         },
         "unknown": compiled.program.unknown,
         "state": compiled.arguments,

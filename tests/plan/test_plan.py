@@ -14,8 +14,9 @@ import pytest
 from pewm_jax import presets as configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
 from pewm_jax.data import abstract
-from pewm_jax.plan import hlo, measure, plan, suggest
+from pewm_jax.plan import measure, plan, suggest
 from pewm_jax.plan.measure import Compiled, MeshSizes
+from pewm_jax.plan.program import Collective, Program
 from pewm_jax.plan.suggest import counts
 from pewm_jax.train import chips, flops, stages
 from pewm_jax.worlds.pewm.world import STAGES
@@ -131,7 +132,7 @@ def work(name, number):
 
 
 def compiled(mesh, temporary):
-    return Compiled(hlo.Program((), (), ()), 0.0, temporary, mesh, 0.0)
+    return Compiled(Program(), 0.0, temporary, mesh, 0.0)
 
 
 @pytest.mark.slow
@@ -197,8 +198,8 @@ def test_temporary_memory_follows_the_share_of_the_clips_in_the_chip_s_precision
 def test_what_is_sent_along_an_axis_is_found_by_its_groups():
     mesh = MeshSizes(data=2, context=2)
     sent = [("all-gather", (0, 1), 5.0), ("all-gather", (0, 2), 7.0), ("all-reduce", (2, 3), 1.0)]
-    items = tuple(hlo.Collective(kind, "", group, size) for kind, group, size in sent)
-    program = Compiled(hlo.Program((), items, ()), 0.0, 0.0, mesh, 0.0)
+    items = [Collective(*item) for item in sent]
+    program = Compiled(Program(collectives=items), 0.0, 0.0, mesh, 0.0)
     assert program.sent_along("context") == {"all-gather": 5.0, "all-reduce": 1.0}
     assert program.sent_along("data") == {"all-gather": 7.0}
 
