@@ -75,10 +75,7 @@ def arguments(argv: Sequence[str], prog: str) -> Arguments:
 def of_world(name: str, known: Sequence[str], what: str) -> Config:
     """Return the own defaults of a world that a plugin or an installed package registers.
 
-    Args:
-        name: the world's.
-        known: what else could have been meant, for the message.
-        what: what these are.
+    ``known`` and ``what``: what else could have been meant, for the message.
 
     Raises:
         ConfigError: there is no such world.

@@ -26,7 +26,7 @@ from pewm_jax.plan.program import Collective, Program
 from pewm_jax.train import flops, sharding, step
 from pewm_jax.train.chips import Chip
 from pewm_jax.train.flops import Work
-from pewm_jax.train.stages import Stage
+from pewm_jax.worlds.stages import Stage
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 """Compiler options that save time. They affect only the generated machine code, which is never
@@ -97,7 +97,7 @@ class Compiled:
     """What the compiler reports about a step on virtual CPU devices; bytes are per device.
 
     Attributes:
-        program: its products and communication.
+        program: its work.
         arguments: bytes of state and batch.
         temporary: bytes of temporary memory and new outputs.
         mesh: the mesh for which it was compiled.
@@ -178,14 +178,7 @@ def virtual(count: int) -> Sequence[Any]:
 
 
 def work_of(config: Config, stage: Stage, traced: jax.stages.Traced, chip: Chip | None) -> StepWork:
-    """Count the work of a stage's step.
-
-    Args:
-        config: the experiment.
-        stage: the stage.
-        traced: from ``trace``.
-        chip: the target chip; None for a CPU.
-    """
+    """Count the work of a stage's step, traced by ``trace``, on a chip (None: a CPU)."""
     config = as_on_chips(config)
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
     given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
@@ -203,12 +196,7 @@ def trace(config: Config, stage: Stage, devices: Sequence[Any]) -> jax.stages.Tr
 
 
 def compile_traced(traced: jax.stages.Traced, mesh: Mesh | MeshSizes) -> Compiled:
-    """Compile a traced step, and measure the program.
-
-    Args:
-        traced: from ``trace``.
-        mesh: the mesh for which it was traced, or its sizes.
-    """
+    """Compile a step that ``trace`` traced for a mesh, or its sizes, and measure the program."""
     began = time.monotonic()
     compiled = traced.lower().compile(compiler_options=QUICK)
     text = compiled.as_text()

@@ -27,10 +27,10 @@ from pewm_jax.plan.measure import Compiled, MeshSizes, virtual
 from pewm_jax.plan.program import COLLECTIVES
 from pewm_jax.plan.suggest import Arrangement
 from pewm_jax.plan.target_compiler import StageReport
-from pewm_jax.train import chips, sharding, stages
+from pewm_jax.train import chips, runs, sharding
 from pewm_jax.train.chips import Chip
 from pewm_jax.train.log import duration
-from pewm_jax.train.stages import Stage
+from pewm_jax.worlds.stages import Stage
 
 MOST_ARRAYS = 1000
 """Number of trained parameter arrays above which `--compiled auto` does not compile. Each array has
@@ -67,7 +67,7 @@ class StagePlan:
         config: the experiment.
         stage: the stage.
         chip: the kind of device.
-        choice: the requested arrangement, with its memory and time.
+        choice: the requested arrangement.
         compiled: the compiler's report; None if the step was not compiled.
         best: the best arrangements.
     """
@@ -105,7 +105,7 @@ def show(
     if on_target:
         topology.require_compiler(chip)
     sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
-    planned = stages.planned(config)
+    planned = runs.planned(config)
     for stage in planned:
         sharding.require_divisible(config, stage, sizes.abstract)
     if not on_target:
@@ -169,14 +169,9 @@ def _plan_on_cpu(
 def plan_stage(
     config: Config, stage: Stage, sizes: MeshSizes, chip: Chip, *, compiles: bool = True
 ) -> StagePlan:
-    """Plan one stage.
+    """Plan one stage on the requested mesh.
 
-    Args:
-        config: the experiment.
-        stage: the stage.
-        sizes: the requested mesh.
-        chip: the kind of device.
-        compiles: whether to compile the step, for temporary memory and communication.
+    ``compiles``: whether to compile the step, for temporary memory and communication.
     """
     traced = measure.trace(config, stage, virtual(sizes.devices))
     compiled = measure.compile_traced(traced, sizes) if compiles else None

@@ -133,7 +133,8 @@ class _Walk:
             opcode = line.opcode
             if opcode == "while":
                 body, trips = self.computation(line.called), hlo.trips(line, self.computations)
-                if trips is None and body != Program():
+                counts = body.flops or body.collectives or (self.for_chip and body.bytes)
+                if trips is None and counts:
                     self.unknown.append(line.label)
                 work.add(body, 1 if trips is None else trips)
             elif opcode == "conditional":

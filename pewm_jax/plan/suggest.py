@@ -23,8 +23,8 @@ from pewm_jax.io import tree
 from pewm_jax.plan.measure import Compiled, MeshSizes, StepWork, in_bfloat16
 from pewm_jax.train import sharding
 from pewm_jax.train.chips import Chip
-from pewm_jax.train.stages import Stage
 from pewm_jax.train.step import TrainState, create
+from pewm_jax.worlds.stages import Stage
 
 MARGIN = 0.9
 """Fraction of the memory that a plan may use; the runtime and fragmentation need the rest."""
@@ -108,13 +108,9 @@ class Prediction:
 
 @dataclasses.dataclass(frozen=True)
 class Arrangement:
-    """A device mesh, with its memory and time for a stage.
+    """A device mesh, with the memory and time of a stage on it.
 
-    Attributes:
-        mesh: the number of devices along each axis.
-        memory: memory of one device.
-        time: predicted time of a step.
-        fits: whether the memory suffices, as far as known.
+    ``fits`` says whether the memory suffices, as far as known.
     """
 
     mesh: MeshSizes
@@ -174,15 +170,9 @@ def memory_of(
 ) -> Memory:
     """Return the memory of one device.
 
-    Temporary memory beyond the gradients is that of the compiled program, scaled to a device's
-    share of the batch, heads and tokens. In bfloat16 it is half of the CPU's, which computes in
-    float32.
-
-    Args:
-        config: the experiment.
-        stage: the stage.
-        mesh: the device mesh.
-        compiled: the program compiled for a mesh, which may be another one.
+    Temporary memory beyond the gradients is that of the program compiled for a mesh, which may be
+    another one, scaled to a device's share of the batch, heads and tokens. In bfloat16 it is half
+    of the CPU's, which computes in float32.
     """
     shapes = abstract_state(config, stage)
     placed = sharding.of_state(config.model, mesh.abstract, shapes)
@@ -232,7 +222,7 @@ def predict(
     work: StepWork,
     compiled: Compiled | None = None,
 ) -> Prediction:
-    """Predict the time of a stage's step on a chip; arguments as for ``assess``."""
+    """Predict the time of a stage's step on a chip."""
     clips, done = stage.settings(config).batch, work.on_device(mesh)
     peak = chip.flops if config.model.dtype == "bfloat16" else chip.flops / 2
     products_s = sum(flops / (peak * REACHED[kind]) for kind, flops in done.items())
@@ -328,14 +318,7 @@ def assess(
 ) -> Arrangement:
     """Compute a stage's memory and time on a mesh of one kind of device.
 
-    Args:
-        config: the experiment.
-        stage: the stage.
-        mesh: the device mesh.
-        chip: the kind of device.
-        work: the work of a step.
-        compiled: the program compiled for the requested mesh; without it, temporary memory is
-            unknown.
+    Without ``compiled``, the program for the requested mesh, temporary memory is unknown.
     """
     memory = memory_of(config, stage, mesh, compiled)
     time = predict(config, stage, mesh, chip, work, compiled)

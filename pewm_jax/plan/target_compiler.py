@@ -113,13 +113,7 @@ def sent_by_axes(sent: Mapping[tuple[str, str], float]) -> list[dict[str, Any]]:
 
 
 def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> StageReport:
-    """Compile a stage in a process of its own.
-
-    Args:
-        config: the experiment.
-        stage: the name of the stage.
-        chip: the kind of device.
-        devices: number of devices.
+    """Compile the stage of this name in a process of its own.
 
     Raises:
         UserError: the compiler is not installed, or it fails for another reason than memory.
@@ -209,9 +203,9 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
 
     from pewm_jax.data import abstract  # noqa: PLC0415
     from pewm_jax.plan import measure, program, suggest  # noqa: PLC0415
-    from pewm_jax.train import sharding, stages, step  # noqa: PLC0415
+    from pewm_jax.train import runs, sharding, step  # noqa: PLC0415
 
-    (stage,) = (one for one in stages.planned(config) if one.name == stage_name)
+    (stage,) = (one for one in runs.planned(config) if one.name == stage_name)
     devices = topology.devices(chip, count)
     mesh = sharding.make_mesh(devices, config.train.mesh)
     sizes = measure.MeshSizes(**{name: mesh.shape[name] for name in AXES})

@@ -117,12 +117,7 @@ class Depth(PictureCost):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Perceptual(PictureCost):
-    """LPIPS distance to the goal; ``perceptual`` loads its weights.
-
-    Attributes:
-        net: the network.
-        params: its parameters.
-    """
+    """LPIPS distance to the goal; ``perceptual`` loads its weights."""
 
     net: Net
     params: Params = dataclasses.field(repr=False)
@@ -136,12 +131,9 @@ class Perceptual(PictureCost):
 def perceptual(
     path: str | Path | None = None, net: Net = "alex", weights: tuple[float, ...] | None = None
 ) -> Perceptual:
-    """Return LPIPS as a cost, with weights from a file or the installed package.
+    """Return LPIPS as a cost, with weights from a file (``models.lpips.convert``) or the package's.
 
-    Args:
-        path: a file of weights (``models.lpips.convert``), or None for the package's.
-        net: the network.
-        weights: see ``PictureCost``.
+    ``weights``: see ``PictureCost``.
 
     Raises:
         UserError: there are no weights, or they are damaged or of another network.
@@ -168,9 +160,8 @@ def _batch_size(rgb_PHWC: Array) -> int:
 class Features(PictureCost):
     """Mean squared difference of an image encoder's features.
 
-    Attributes:
-        settings: an encoder (``models.encoders``), or a model, whose memory's encoder is used.
-        params: the encoder's parameters, or the world model's.
+    ``settings`` is an encoder (``models.encoders``), with its parameters; or a model, whose
+    memory's encoder is used, with the model's.
     """
 
     settings: Encoder | AssembledModel
@@ -220,10 +211,7 @@ class Distance:
 def straight(poses_K44: Any, goal_44: Any, metres_per_radian: float = 0.25) -> Array:
     """Return the Euclidean distance plus the weighted difference of yaw, metres.
 
-    Args:
-        poses_K44: (K, 4, 4) poses.
-        goal_44: (4, 4) pose of the goal.
-        metres_per_radian: weight of a radian of yaw.
+    ``poses_K44`` are (K, 4, 4) poses, ``goal_44`` the goal's.
     """
     poses, goal = jnp.asarray(poses_K44), jnp.asarray(goal_44)
     apart = jnp.linalg.norm(poses[:, :3, 3] - goal[:3, 3], axis=-1)
@@ -233,11 +221,7 @@ def straight(poses_K44: Any, goal_44: Any, metres_per_radian: float = 0.25) -> A
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sum:
-    """A weighted sum of costs.
-
-    Attributes:
-        parts: ``(weight, cost)`` pairs.
-    """
+    """A weighted sum of costs, from ``(weight, cost)`` pairs."""
 
     parts: tuple[tuple[float, FrameCost], ...]
 
@@ -247,11 +231,6 @@ class Sum:
 
 
 def with_depth(cost: FrameCost, weight: float) -> Sum:
-    """Return a cost that also compares depth.
-
-    Args:
-        cost: the cost of colours.
-        weight: weight of the mean log-depth difference (``Depth``).
-    """
+    """Return a cost that adds the weighted log-depth difference (``Depth``) to another cost."""
     weights = getattr(cost, "weights", None)
     return Sum(((1.0, cost), (weight, Depth(weights=weights))))

@@ -140,10 +140,8 @@ def reached(pose: Array, goal: Array, within_m: float = 0.5, within_deg: float =
 def satisfied(seen: dict[str, Array], cost: Callable[[Array], Array], at_most: float) -> Array:
     """Return whether a cost of the observed image is at most a bound: a goal without a pose.
 
-    Args:
-        seen: the observation of a single step.
-        cost: an image (H, W, 3) uint8 → a number, such as the distance to a goal image.
-        at_most: the bound, included.
+    ``seen`` is the observation of a single step; ``cost`` maps an image (H, W, 3) uint8 to a
+    number, such as the distance to a goal image.
     """
     return jnp.asarray(cost(seen["rgb"]) <= at_most)
 

@@ -187,9 +187,9 @@ def walks(
         practice: number and length of walks.
         seed: seed of starts, goals and actions; equal seeds give equal starts in every environment.
 
-    Returns:
-        The walks, generated lazily; all have the same number of frames if the policy always
-        proposes the same number of actions.
+    Yields:
+        Walks with the same number of frames if the policy always proposes the same number of
+        actions.
 
     Raises:
         UserError: the policy does not return discrete actions.
@@ -215,13 +215,9 @@ def walks(
 
 
 class ImaginedEnvironment:
-    """A world as an environment for practice.
+    """A world as an environment for practice, started from posed RGB-D frames.
 
-    Args:
-        config: the world.
-        params: its weights.
-        seen: posed RGB-D frames with which it starts.
-        memory: if False, the world's memory is not used.
+    If ``memory`` is False, the world's memory is not used.
     """
 
     def __init__(self, config: Config, params: Params, seen: Frames, *, memory: bool = True):
@@ -261,10 +257,7 @@ class ImaginedEnvironment:
 class SimulatedEnvironment:
     """A simulator as an environment for practice: equally many real walks.
 
-    Args:
-        simulator: the house.
-        motion: the motion of an action.
-        seen: frames whose poses walks start from.
+    Walks start from the poses of the frames ``seen``; ``motion`` is that of an action.
     """
 
     def __init__(self, simulator: Simulator, motion: ActionConfig, seen: Frames):
@@ -299,11 +292,7 @@ def planar(world_from_camera: np.ndarray) -> np.ndarray:
 
 
 def require_discrete(actions_N: Any, who: str) -> np.ndarray:
-    """Return a copy of discrete actions (N,).
-
-    Raises:
-        UserError: they are not discrete actions.
-    """
+    """Return a copy of (N,) discrete actions, or raise UserError if they are none."""
     actions = np.array(actions_N)
     known = actions.dtype.kind in "iu" and actions.ndim == 1 and actions.size > 0
     if not known or not ((actions >= 0) & (actions < len(NAMES))).all():

@@ -24,13 +24,7 @@ _move = jax.jit(worlds.move, static_argnums=0, static_argnames="leave")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Engine:
-    """A trained world model.
-
-    Attributes:
-        name: its name, for display.
-        config: the experiment.
-        params: its parameters, on the device.
-    """
+    """A trained world model: its name for display, the experiment, its parameters on the device."""
 
     name: str
     config: Config

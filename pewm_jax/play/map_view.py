@@ -9,7 +9,7 @@ import numpy as np
 
 from pewm_jax.play import picking
 from pewm_jax.play.engine import Engine
-from pewm_jax.play.extra import viser
+from pewm_jax.play.serving import viser
 from pewm_jax.play.session import Session, pose
 
 DARK, PATH, IMAGINED, BOX, GOAL = (
@@ -84,13 +84,7 @@ class MapView:
         return self._points
 
     def show(self, engine: Engine, session: Session, image: np.ndarray | None = None) -> None:
-        """Show a drive: its map, the agent, and its path.
-
-        Args:
-            engine: the model.
-            session: the drive.
-            image: the agent's frame, uint8, drawn into its frustum.
-        """
+        """Show a drive: its map, the agent with its frame (uint8) in the frustum, and its path."""
         with self._lock:
             before, self._session, self._engine = self._session, session, engine
             with self._server.atomic():

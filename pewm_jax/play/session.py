@@ -140,11 +140,7 @@ def apply(
 ) -> Session:
     """Return the drive after an event.
 
-    Args:
-        engine: the model.
-        session: the drive so far.
-        event: the event.
-        made: the result of ``ahead`` for this session and this event's action, if there is one.
+    ``made`` is the result of ``ahead`` for this session and this event's action, if there is one.
 
     Raises:
         UserError: the box is empty, or the memory cannot be edited.

@@ -21,8 +21,8 @@ from pewm_jax import worlds
 from pewm_jax.config import AXES, Config, ConfigError, MeshConfig, World
 from pewm_jax.io import tree
 from pewm_jax.nn.placement import BATCH
-from pewm_jax.train.stages import Stage
 from pewm_jax.types import Params
+from pewm_jax.worlds.stages import Stage
 
 ALL_DATA = MeshConfig()
 """All devices along ``data``."""
@@ -87,13 +87,7 @@ def constrain(model: World, params: Params) -> Params:
 
 
 def left_out(model: World, mesh: Mesh | AbstractMesh, state: Any) -> dict[str, tuple[str, ...]]:
-    """Return the leaves that are not sharded as their rule says, and the mesh axes dropped.
-
-    Args:
-        model: defines the sharding rules.
-        mesh: the devices.
-        state: a (possibly abstract) state.
-    """
+    """Return the leaves that are not sharded as their rule says, and the mesh axes dropped."""
     leaves, specs = tree.flatten(state), tree.flatten(_specs(model, state))
     missed = {path: _fit_spec(mesh, leaf, specs[path])[1] for path, leaf in leaves.items()}
     return {path: axes for path, axes in missed.items() if axes}
@@ -142,12 +136,9 @@ def place(values: Any, like: Any) -> Any:
     """Place weights on the devices: leaf by leaf, and only this process's shards of each leaf.
 
     Args:
-        values: nested dictionaries of arrays: NumPy arrays, including memory-mapped ones
-            (``weights.lazy``), or JAX arrays, which are moved between devices.
-        like: abstract arrays with shardings, for at least these paths.
-
-    Returns:
-        The same tree as JAX arrays, in the dtypes of ``like``.
+        values: nested dictionaries of NumPy arrays, including memory-mapped ones, or of JAX arrays,
+            which are moved between devices.
+        like: abstract arrays with dtypes and shardings, for at least these paths.
     """
     given, wanted = tree.flatten(values), tree.flatten(like)
     moved = {path: leaf for path, leaf in given.items() if isinstance(leaf, jax.Array)}
@@ -176,8 +167,7 @@ def require_divisible(config: Config, stage: Stage, mesh: Mesh | AbstractMesh) -
     """Raise an error if the batch, heads or channels cannot be sharded evenly.
 
     Raises:
-        ConfigError: the batch is not a multiple of the devices that share it, or the heads and
-            hidden channels are not multiples of those that share them.
+        ConfigError: they are not multiples of the devices that share them.
     """
     batch, devices = stage.settings(config).batch, math.prod(mesh.shape[axis] for axis in BATCH)
     if batch % devices:

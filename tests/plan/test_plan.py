@@ -18,7 +18,7 @@ from pewm_jax.plan import measure, plan, suggest
 from pewm_jax.plan.measure import Compiled, MeshSizes
 from pewm_jax.plan.program import Collective, Program
 from pewm_jax.plan.suggest import counts
-from pewm_jax.train import chips, flops, stages
+from pewm_jax.train import chips, flops, runs
 from pewm_jax.worlds.pewm.world import STAGES
 from tests.train import fakes
 
@@ -79,7 +79,7 @@ def test_a_plan_need_not_be_compiled_and_is_not_where_that_takes_very_long(monke
 
 def test_the_u_net_of_svd_has_too_many_arrays_to_compile():
     config = configs.load("egowm_svd")
-    (stage,) = stages.planned(config)
+    (stage,) = runs.planned(config)
     assert not plan._should_compile(config, stage, launch())
     assert plan._should_compile(config, stage, dataclasses.replace(launch(), compiled="on"))
 

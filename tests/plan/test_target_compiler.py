@@ -249,7 +249,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 from pewm_jax import config, presets
 from pewm_jax.data import abstract
 from pewm_jax.nn import target
-from pewm_jax.train import stages, step
+from pewm_jax.train import step
 from pewm_jax.worlds.pewm.world import STAGES
 import dataclasses
 
