@@ -167,28 +167,23 @@ GROUPS = {
 """One-line descriptions of groups of commands."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit code: 0, 1 problems found, 2 bad input, 130 interrupted."""
-    return parser.run(execute, argv)
+def main(argv: Sequence[str] | None = None, called: str = "") -> int:
+    """Run a command and return the exit code: 0, 1 problems found, 2 bad input, 130 interrupted.
+
+    ``called``: the words typed instead of ``pewm-jax`` and the first word.
+    """
+    return parser.run(lambda words: execute(words, called), argv)
 
 
 def deprecated(group: str) -> int:
     """Run a group of commands called as a module and return the exit code."""
     called = f"python -m pewm_jax.{group}"
     print(f"warning: `{called}` is deprecated; use `{PROGRAM} {group}`.", file=sys.stderr)
-    return parser.run(lambda argv: execute([group, *argv], called))
+    return main([group, *sys.argv[1:]], called)
 
 
 def execute(argv: Sequence[str], called: str = "") -> int:
-    """Run a command; errors are raised.
-
-    Args:
-        argv: the words of the command and its arguments.
-        called: the words typed instead of ``pewm-jax`` and the first word.
-
-    Returns:
-        The exit code.
-    """
+    """Run a command and return its exit code; errors are raised. ``called``: as for ``main``."""
     if argv and argv[0] == "--version":
         print(f"{PROGRAM} {pewm_jax.__version__}")
         return 0

@@ -28,8 +28,7 @@ try:
     import viser
     import viser.transforms
     import websockets.asyncio.server
-    from websockets.datastructures import Headers
-    from websockets.http11 import Request, Response
+    from websockets.http11 import Request
 except ImportError:
     raise UserError(
         "the live viewer needs viser, which is not installed: pip install 'pewm-jax[play]'."
@@ -162,7 +161,7 @@ def refuse_other_sites(
             if reason not in reported and len(reported) < MOST_REPORTED:
                 reported.add(reason)
                 log(f"refused: {reason}")
-            return _forbidden(reason)
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
 
         servers.append(process)
         return plain(*args, process_request=process, **rest)
@@ -172,15 +171,6 @@ def refuse_other_sites(
         yield servers
     finally:
         home.serve = plain  # type: ignore[assignment]
-
-
-def _forbidden(reason: str) -> Response:
-    body = f"{reason}\n".encode()
-    headers = Headers([("Content-Type", "text/plain; charset=utf-8")])
-    headers["Content-Length"] = str(len(body))
-    headers["Connection"] = "close"
-    status = http.HTTPStatus.FORBIDDEN
-    return Response(status.value, status.phrase, headers, body)
 
 
 def _parts(address: str) -> SplitResult | None:
