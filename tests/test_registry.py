@@ -14,7 +14,6 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
 from pewm_jax import registry as kinds
-from pewm_jax.cli import evaluate as evaluation
 from pewm_jax.cli import main as program
 from pewm_jax.cli import parser as cli
 from pewm_jax.cli import plugins as imports
@@ -145,7 +144,7 @@ def test_a_world_of_an_entry_point_is_trained_and_gets_a_protocol_by_its_name(
     monkeypatch.syspath_prepend(str(tmp_path))
     given = training.arguments(["mine"], "pewm-jax train")
     assert given.groups["config"][1].model.width == 3
-    assert evaluation._settings_of("mine").model.width == 3
+    assert training.settings_of("mine", "preset or run")[0].model.width == 3
     with pytest.raises(ConfigError, match=r"no preset 'dmo' \(did you mean demo.*no_such_library"):
         training.arguments(["dmo"], "pewm-jax train")
 

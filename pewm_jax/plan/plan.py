@@ -176,9 +176,9 @@ def plan_stage(
     traced = measure.trace(config, stage, virtual(sizes.devices))
     compiled = measure.compile_traced(traced, sizes) if compiles else None
     work = measure.work_of(config, stage, traced, chip)
-    choice = suggest.assess(config, stage, sizes, chip, work, compiled)
-    best = suggest.rank(config, stage, sizes, chip, work, compiled)[:3]
-    return StagePlan(config, stage, chip, choice, compiled, tuple(best))
+    job = suggest.Job(config, stage, chip, work, compiled)
+    best = job.rank(sizes.devices, sizes.context)[:3]
+    return StagePlan(config, stage, chip, job.assess(sizes), compiled, tuple(best))
 
 
 def estimate(plan: StagePlan) -> StageReport:

@@ -67,7 +67,7 @@ class FloorMap:
     def __init__(self) -> None:
         self._points = np.zeros((0, 3))
         self._cameras = np.zeros(0)
-        self._cells: set[tuple[int, int]] | None = None
+        self._cells: np.ndarray | None = None
 
     def add(self, frames: Frames) -> None:
         """Add (T,) posed depth; 0 is no measurement."""
@@ -87,27 +87,17 @@ class FloorMap:
 
     def free(self, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
         """Return whether the straight line between two points has no obstacle."""
-        cells = self._occupied()
-        reach = int(np.ceil(RADIUS_M / CELL_M)) + 1
-        around = np.arange(-reach, reach + 1)
-        for share in np.linspace(0, 1, WAY_SAMPLES)[1:]:
-            place = np.asarray(start_xy) + share * (np.asarray(end_xy) - np.asarray(start_xy))
-            middle = np.floor(place / CELL_M).astype(int)
-            for dx in around:
-                for dy in around:
-                    cell = int(middle[0] + dx), int(middle[1] + dy)
-                    if cell in cells:
-                        away = (np.array(cell) + 0.5) * CELL_M - place
-                        if np.hypot(*away) < RADIUS_M:
-                            return False
-        return True
+        start, end = np.asarray(start_xy), np.asarray(end_xy)
+        places = [start + share * (end - start) for share in np.linspace(0, 1, WAY_SAMPLES)[1:]]
+        away = self._occupied()[:, None] - np.stack(places)
+        return not (np.hypot(away[..., 0], away[..., 1]) < RADIUS_M).any()
 
-    def _occupied(self) -> set[tuple[int, int]]:
-        """Return the cells with obstacles, computed on first use."""
+    def _occupied(self) -> np.ndarray:
+        """Return the centres (n, 2) of cells with obstacles, computed on first use."""
         if self._cells is None:
             points = self._points
             if not len(points):
-                return set()
+                return np.zeros((0, 2))
             height = points[:, 2]
             floor = np.percentile(height, FLOOR_PERCENTILE)
             body = (height > floor + ABOVE_FLOOR_M) & (
@@ -116,7 +106,7 @@ class FloorMap:
             cells, counts = np.unique(
                 np.floor(points[body, :2] / CELL_M).astype(int), axis=0, return_counts=True
             )
-            self._cells = {(int(x), int(y)) for x, y in cells[counts >= LEAST_POINTS]}
+            self._cells = (cells[counts >= LEAST_POINTS] + 0.5) * CELL_M
         return self._cells
 
 

@@ -21,6 +21,7 @@ from pewm_jax.plan.measure import MeshSizes
 from pewm_jax.plan.program import COLLECTIVES
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.both import BothConfig
+from pewm_jax.train import chips
 from pewm_jax.worlds.pewm.world import PEWM, STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)
@@ -96,7 +97,7 @@ def compare(number, settings, devices):
     traced = measure.trace(config, stage, used)
     compiled = measure.compile_traced(traced, mesh)
     work = measure.work_of(config, stage, traced, None)
-    sent = suggest.traffic(config, stage, mesh, work, compiled)
+    sent = suggest.Job(config, stage, chips.named("h200"), work, compiled).traffic(mesh)
     return {
         "flops": compiled.program.flops,
         "flops_expected": sum(work.on_device(mesh).values()),

@@ -145,9 +145,8 @@ def test_the_presets_fit_on_h200_in_both_stages(name, temporary, devices):
     config = configs.load(name)
     eight, mesh = (MeshSizes(*config.train.mesh.shape(n)) for n in (8, devices))
     for stage, held in zip(STAGES[:2], temporary, strict=True):
-        choice = suggest.assess(
-            config, stage, mesh, H200, work(name, stage.number), compiled(eight, held)
-        )
+        found = work(name, stage.number)
+        choice = suggest.Job(config, stage, H200, found, compiled(eight, held)).assess(mesh)
         assert choice.fits, (stage.number, choice.memory)
         assert 0.2 < choice.time.mfu < 0.65
 
@@ -155,7 +154,8 @@ def test_the_presets_fit_on_h200_in_both_stages(name, temporary, devices):
 def test_every_suggestion_uses_all_devices_and_shares_batch_and_heads():
     config = configs.load("pewm_2b")
     stage, mesh = STAGES[1], MeshSizes(fsdp=64)
-    ranked = suggest.rank(config, stage, mesh, H200, work("pewm_2b", 2), compiled(mesh, 12e9))
+    job = suggest.Job(config, stage, H200, work("pewm_2b", 2), compiled(mesh, 12e9))
+    ranked = job.rank(mesh.devices)
     assert len(ranked) == len({choice.mesh for choice in ranked}) > 10
     for choice in ranked:
         mesh = choice.mesh
