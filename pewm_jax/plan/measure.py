@@ -158,11 +158,7 @@ class StepWork:
 
 
 def virtual(count: int) -> Sequence[Any]:
-    """Return virtual CPU devices; call it before JAX uses any device.
-
-    Raises:
-        UserError: JAX already uses devices, but too few.
-    """
+    """Return virtual CPU devices; call it before JAX uses any device, or UserError is raised."""
     try:
         jax.config.update("jax_platforms", "cpu")
         jax.config.update("jax_num_cpu_devices", count)

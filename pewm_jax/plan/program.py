@@ -48,10 +48,10 @@ _KERNEL = re.compile(r"dim_labels=\w+_(\w+)->")
 
 @dataclasses.dataclass(frozen=True)
 class Collective:
-    """A collective communication between devices.
+    """A collective communication (``COLLECTIVES``) between devices.
 
     Attributes:
-        kind: one of ``COLLECTIVES``.
+        kind: its kind.
         group: one of the groups of devices that communicate, by their index in the mesh.
         sent: bytes that a device sends in all its executions, with ring algorithms.
     """

@@ -115,11 +115,7 @@ GPUS_OF_A_HOST = 8
 
 
 def require_compiler(chip: Chip) -> None:
-    """Check that the compiler of a chip is installed.
-
-    Raises:
-        UserError: it is not; the message names the extra that installs it.
-    """
+    """Check that a chip's compiler is installed; the error names the extra that installs it."""
     versions = _versions(chip)
     missing = [name for name in PACKAGES[chip.platform] if name not in versions]
     if missing:
@@ -186,10 +182,10 @@ def devices(chip: Chip, count: int) -> Sequence[Any]:
 
 
 def tpu_topology(chip: Chip, count: int) -> str:
-    """Return the name of the topology that is closest to a square or cube: ``v5p:2x2x2``.
+    """Return the name of the topology of this many devices closest to a square or cube.
 
     Raises:
-        UserError: there is none of this many devices.
+        UserError: there is none.
     """
     chips, odd = divmod(count, 2) if chip.name == "tpu7x" else (count, 0)
     axes = 2 if chip.name in ("v5e", "v6e") else 3

@@ -40,10 +40,9 @@ AT_ONCE = 2**18
 
 @dataclasses.dataclass(frozen=True)
 class PictureCost:
-    """A cost of single images, computed for the last frame or for all with weights.
+    """A cost of single images, computed for the last frame or for all.
 
-    Attributes:
-        weights: weight of each of the N frames in the mean, or None for the last frame only.
+    ``weights`` are those of each of the N frames in the mean, or None for the last frame only.
     """
 
     weights: tuple[float, ...] | None = dataclasses.field(default=None, kw_only=True)
@@ -58,11 +57,7 @@ class PictureCost:
         )
 
     def __call__(self, frames: Frames, goal: Frames) -> Array:
-        """Return (K,) costs.
-
-        Raises:
-            UserError: frames and goal differ in size, or the numbers of weights and frames differ.
-        """
+        """Return (K,) costs; frames and goal have one size, and each frame has a weight."""
         frames, goal = as_signal(frames), as_signal(goal)
         count = _require_alike(frames, goal)
         if self.weights is not None and len(self.weights) != count:
@@ -194,10 +189,9 @@ def _features(
 class Distance:
     """The true distance of the last pose from the goal: an oracle, to evaluate planners alone.
 
-    Attributes:
-        function: maps poses (K, 4, 4) and the goal's pose (4, 4), ``world_from_camera``, to (K,)
-            distances (inf if unreachable), such as metres along the shortest path, in NumPy or
-            JAX; for example ``straight``.
+    ``function`` maps poses (K, 4, 4) and the goal's pose (4, 4), ``world_from_camera``, to (K,)
+    distances (inf if unreachable), such as metres along the shortest path, in NumPy or JAX; for
+    example ``straight``.
     """
 
     function: Callable[[Any, Any], Any]

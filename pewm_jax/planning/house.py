@@ -121,14 +121,10 @@ class HouseEnv(GoalEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: seed of all randomness from here on.
-            options: must be empty.
+        """Start an episode; there are no options.
 
         Raises:
-            UserError: the scene is too small for the task.
+            UserError: the scene is too small for the task, or there are options.
         """
         super().reset(seed=seed)
         if options:
@@ -169,9 +165,6 @@ class HouseEnv(GoalEnv):
         """Return the frames of one full turn in place; the state does not change.
 
         The last frame is the present one, so a world can be started from these frames.
-
-        Raises:
-            UserError: before the first ``reset``.
         """
         turns = max(1, round(360 / self.config.turn_deg))
         planar = np.tile(self.planar, (turns, 1))
@@ -179,11 +172,7 @@ class HouseEnv(GoalEnv):
         return self._simulator.frames(planar)
 
     def goal_frame(self) -> Frames:
-        """Return the frame at the goal.
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
+        """Return the frame at the goal; there is none before the first ``reset``."""
         _ = self.task
         return self._goal
 
@@ -194,22 +183,14 @@ class HouseEnv(GoalEnv):
 
     @property
     def task(self) -> Task:
-        """Return the episode's task.
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
+        """Return the episode's task, or raise UserError before the first ``reset``."""
         if self._task is None:
             raise UserError("the house has no episode yet: call reset() first.")
         return self._task
 
     @property
     def planar(self) -> np.ndarray:
-        """Return a copy of the agent's pose: x, y, yaw in (−π, π], float64.
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
+        """Return a copy of the agent's pose: x, y, yaw in (−π, π], float64."""
         _ = self.task
         return self._planar.copy()
 

@@ -61,14 +61,10 @@ def reset(
     *,
     depth_scale: float | None = None,
 ) -> ImaginedState:
-    """Start from observed frames.
+    """Start from S ≥ 1 posed RGB-D frames; the last one is the present.
 
-    Args:
-        model: the model's settings, or an experiment's; static under jit.
-        params: the world model's parameters.
-        frames: S ≥ 1 posed RGB-D frames; the last one is the present.
-        key: for worlds with a random start; the library has none.
-        depth_scale: as for ``worlds.start``.
+    ``model`` is static under jit. ``key`` is for worlds with a random start; the library has none.
+    ``depth_scale``: as for ``worlds.start``.
 
     Raises:
         UserError: the frames do not fit the model, or are invalid; see ``worlds.start``.

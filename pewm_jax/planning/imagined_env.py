@@ -86,12 +86,10 @@ class WorldModelEnv(GoalEnv):
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start an episode from real frames.
 
-        Args:
-            seed: seed of all randomness from here on, including the sampling noise; it also
-                determines the house's episode.
-            options: ``frames``: S ≥ 1 posed frames (an episode's, or ``frames_of`` of a house's
-                observations), and ``goal``: the frame at the goal. Without options an episode of
-                the house starts, in which the agent first makes a full turn.
+        ``options`` are ``frames``, S ≥ 1 posed frames (an episode's, or ``frames_of`` of a house's
+        observations), and ``goal``, the frame at the goal. Without options an episode of the house
+        starts, in which the agent first makes a full turn. The seed determines the house's episode
+        and the sampling noise.
 
         Raises:
             UserError: the frames do not fit the model or are invalid, or there is no goal.

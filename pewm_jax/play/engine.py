@@ -61,11 +61,7 @@ class Engine:
         return self.model.sample_steps
 
     def with_sampler_steps(self, steps: int) -> Engine:
-        """Return the same model with another number of sampler steps.
-
-        Raises:
-            ConfigError: the sampler does not support this number.
-        """
+        """Return the same model with another number of sampler steps, or raise ConfigError."""
         require(self.sampler_steps > 0, f"{self.name} has no sampler with a number of steps.")
         model = self.model.with_sample_steps(steps)
         return dataclasses.replace(self, config=dataclasses.replace(self.config, model=model))

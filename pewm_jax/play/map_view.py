@@ -27,11 +27,7 @@ FRUSTUM_M, WIDE = 0.3, 1.5
 
 
 class MapView:
-    """The 3D scene of a page.
-
-    Attributes:
-        box_23: (2, 3) the selected box, metres, or None.
-    """
+    """The 3D scene of a page, with the selected box: ``box_23``, (2, 3) metres, or None."""
 
     def __init__(self, server: viser.ViserServer):
         self._server, self._lock = server, threading.RLock()

@@ -68,12 +68,7 @@ the listeners of the root element, which are the hotkeys, run before that."""
 
 
 class Page:
-    """A served page; ``close`` ends it.
-
-    Attributes:
-        url: its address.
-        driver: its driver.
-    """
+    """A page served at ``url`` with its driver; ``close`` ends it."""
 
     def __init__(
         self,

@@ -28,7 +28,7 @@ def names(folder: Path) -> list[str]:
 
 
 def path_of(folder: Path, name: str) -> Path:
-    """Return a world's file; refuse a name that could point outside the folder."""
+    """Return a world's file, or refuse a name that could point outside the folder."""
     plain = re.fullmatch(r"\w[\w \-]*", name) is not None and len(name) <= MOST_NAME
     require(
         plain, f"{name!r} is not a valid name of a world: use letters, digits, spaces and hyphens."

@@ -31,11 +31,7 @@ STILL = np.zeros(3, np.float32)
 
 @dataclasses.dataclass(frozen=True)
 class Drive:
-    """Event: one step.
-
-    Attributes:
-        action: dx, dy, dyaw: metres forward, metres left, radians counter-clockwise.
-    """
+    """Event: one step, (dx, dy, dyaw): metres forward and left, radians counter-clockwise."""
 
     action: tuple[float, float, float]
 

@@ -25,6 +25,7 @@ from pewm_jax.types import Clip, Params
 from pewm_jax.worlds.stages import Stage
 
 AHEAD = 2
+"""Number of batches kept ready on the devices."""
 _POLL_S = 0.2
 
 
@@ -63,19 +64,12 @@ class Feed:
         batches: the source; closed at the end if it has a ``close`` method.
         where: the sharding of every array of a batch.
         batch: the global batch size; the source yields only this process's rows.
-        ahead: number of batches kept ready.
     """
 
-    def __init__(
-        self,
-        batches: Iterator[Clip],
-        where: Sharding,
-        batch: int,
-        ahead: int = AHEAD,
-    ):
+    def __init__(self, batches: Iterator[Clip], where: Sharding, batch: int):
         self._batches = batches
         self._where, self._batch = where, batch
-        self._ready: queue.Queue[Clip | BaseException] = queue.Queue(ahead)
+        self._ready: queue.Queue[Clip | BaseException] = queue.Queue(AHEAD)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._fill, name="feed", daemon=True)
 

@@ -53,7 +53,7 @@ class MetricsLog:
 
         self._wandb = None
         if config is not None and config.train.wandb:
-            self._wandb = WandbLog(config, run, stage)
+            self._wandb = start_wandb(config, run, stage)
         path = run / "metrics.jsonl"
         drop_after(path, stage.number, step)
         self._file = path.open("a")
@@ -76,7 +76,7 @@ class MetricsLog:
             finally:
                 self._events.close()
                 if self._wandb is not None:
-                    self._wandb.close(failed=error is not None)
+                    self._wandb.finish(exit_code=int(error is not None))
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log the scalars of one step; NaN and infinity, which JSON lacks, become null."""
@@ -90,7 +90,7 @@ class MetricsLog:
         for name, value in finite.items():
             self._events.add_scalar(name, value, step)
         if self._wandb is not None:
-            self._wandb.write(step, finite)
+            self._wandb.log(finite, step=step)
 
 
 def drop_after(path: Path, stage: int, step: int) -> None:
@@ -226,42 +226,30 @@ def require_wandb() -> Any:
         ) from None
 
 
-class WandbLog:
-    """Sends the scalars of a stage to the project ``train.wandb`` of Weights & Biases.
-
-    Only one process of a job has one.
+def start_wandb(config: Config, run: Path, stage: Stage) -> Any:
+    """Start or resume the run of a stage in the project ``train.wandb`` of Weights & Biases.
 
     Raises:
         UserError: the package is not installed, no user is logged in, or the run cannot be started.
     """
-
-    def __init__(self, config: Config, run: Path, stage: Stage):
-        wandb = require_wandb()
-        try:
-            self._run = wandb.init(
-                project=config.train.wandb,
-                name=f"{run.name} {stage.name}",
-                group=run.name,
-                id=f"{_id(run)}-{stage.name}",
-                resume="allow",
-                dir=str(run),
-                config=configuration.to_dict(config),
-                settings=wandb.Settings(console="off"),  # the live view prints already
-            )
-        except wandb.Error as error:
-            reason = " ".join(str(error).split()).rstrip(".")
-            raise UserError(
-                f"Weights & Biases cannot start ({reason}): run `wandb login` first, set "
-                "WANDB_MODE=offline to log locally only, or omit --train.wandb."
-            ) from None
-
-    def write(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Log the scalars of one step; a step that was logged before is not changed."""
-        self._run.log(dict(scalars), step=step)
-
-    def close(self, *, failed: bool) -> None:
-        """Flush and finish the run."""
-        self._run.finish(exit_code=int(failed))
+    wandb = require_wandb()
+    try:
+        return wandb.init(
+            project=config.train.wandb,
+            name=f"{run.name} {stage.name}",
+            group=run.name,
+            id=f"{_id(run)}-{stage.name}",
+            resume="allow",
+            dir=str(run),
+            config=configuration.to_dict(config),
+            settings=wandb.Settings(console="off"),  # the live view prints already
+        )
+    except wandb.Error as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise UserError(
+            f"Weights & Biases cannot start ({reason}): run `wandb login` first, set "
+            "WANDB_MODE=offline to log locally only, or omit --train.wandb."
+        ) from None
 
 
 def _id(run: Path) -> str:

@@ -241,8 +241,9 @@ def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
 
 def test_settings_of_a_page_are_those_of_its_parts():
     settings = play.Settings(model="small", house=5, port=0)
-    assert play._part(Start, settings).house == 5
-    assert play._part(Serve, settings).port == 0
+    assert isinstance(settings, Start)
+    assert isinstance(settings, Serve)
+    assert (settings.house, settings.port) == (5, 0)
     with pytest.raises(ConfigError):
         play.Settings(model="small", port=-1)
     assert session.Begin(Start()).start.house == 2
