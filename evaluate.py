@@ -2,7 +2,7 @@
 
 import sys
 
-from pewm_jax.cli import main, parser
+from pewm_jax.cli import main
 
 if __name__ == "__main__":
-    sys.exit(parser.run(lambda argv: main.execute(["evaluate", *argv], "python evaluate.py")))
+    sys.exit(main.main(["evaluate", *sys.argv[1:]], "python evaluate.py"))

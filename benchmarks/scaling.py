@@ -21,7 +21,7 @@ from pewm_jax import presets as configs
 from pewm_jax.config import ClipConfig, Config, MeshConfig
 from pewm_jax.plan.measure import MeshSizes, virtual
 from pewm_jax.plan.plan import StagePlan, arranged, flop, plan_stage, rate, size
-from pewm_jax.train import chips, stages
+from pewm_jax.train import chips, runs
 from pewm_jax.train.log import duration
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
@@ -74,7 +74,7 @@ def row(label: str, plan: StagePlan) -> list[str]:
         label,
         str(plan.stage.number),
         f"{choice.mesh.devices} × {plan.chip.name}",
-        arranged(choice),
+        arranged(choice.mesh.sizes),
         size(choice.memory.peak),
         size(compiled.peak),
         "yes" if choice.fits else "**no**",
@@ -82,7 +82,7 @@ def row(label: str, plan: StagePlan) -> list[str]:
         duration(choice.time.step_s),
         f"{choice.time.mfu:.0%}",
         rate(choice.time.clips_per_s),
-        f"{arranged(best)}: {duration(best.time.step_s)}",
+        f"{arranged(best.mesh.sizes)}: {duration(best.time.step_s)}",
     ]
 
 
@@ -97,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     chip = chips.named(options.chip)
     found = list(cases(options.quick))
     virtual(max(count for *_, count in found))
-    wanted = [(*case, stage) for case in found for stage in stages.planned(case[1])]
+    wanted = [(*case, stage) for case in found for stage in runs.planned(case[1])]
     rows: dict[int, list[str]] = {}
     # The largest first: what is written after each is then never without them.
     for index in sorted(range(len(wanted)), key=lambda k: "5b" not in wanted[k][0]):

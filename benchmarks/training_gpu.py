@@ -36,8 +36,9 @@ from pewm_jax.data import abstract
 from pewm_jax.io import atomic
 from pewm_jax.plan import plan
 from pewm_jax.plan.measure import MeshSizes
-from pewm_jax.train import chips, flops, sharding, stages, step
+from pewm_jax.train import chips, flops, sharding, step
 from pewm_jax.types import Clip
+from pewm_jax.worlds import stages
 from pewm_jax.worlds.pewm.world import STAGES
 
 NAME = "training_gpu"

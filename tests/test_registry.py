@@ -14,8 +14,6 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
 from pewm_jax import registry as kinds
-from pewm_jax.cli import evaluate as evaluation
-from pewm_jax.cli import flags
 from pewm_jax.cli import main as program
 from pewm_jax.cli import parser as cli
 from pewm_jax.cli import plugins as imports
@@ -146,7 +144,7 @@ def test_a_world_of_an_entry_point_is_trained_and_gets_a_protocol_by_its_name(
     monkeypatch.syspath_prepend(str(tmp_path))
     given = training.arguments(["mine"], "pewm-jax train")
     assert given.groups["config"][1].model.width == 3
-    assert evaluation._settings_of("mine").model.width == 3
+    assert training.settings_of("mine", "preset or run")[0].model.width == 3
     with pytest.raises(ConfigError, match=r"no preset 'dmo' \(did you mean demo.*no_such_library"):
         training.arguments(["dmo"], "pewm-jax train")
 
@@ -224,7 +222,7 @@ def test_a_module_that_is_broken_is_refused_in_a_sentence(tmp_path, monkeypatch)
     package(tmp_path, "mine_wrong", "raise ValueError('two\\nlines')", entry=False)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"mine_wrong .*ValueError: two lines") as refusal:
-        imports.take(["tiny", "--import", "mine_wrong"])
+        imports.run(["tiny", "--import", "mine_wrong"])
     one_sentence(refusal)
 
 
@@ -417,7 +415,7 @@ def test_settings_without_a_default_are_asked_for():
         configuration.from_dict(Noise, {"kind": "demanding"})
     one_sentence(refusal)
     with pytest.raises(ConfigError, match="strength have no default") as refusal:
-        flags.take_kinds(["--model.noise.kind", "demanding"], Config())
+        cli.take_kinds(["--model.noise.kind", "demanding"], Config())
     one_sentence(refusal)
 
 
@@ -441,7 +439,7 @@ class Other(World):
 def test_a_world_is_chosen_before_its_parts(tmp_path):
     register("world", "other", Other)
     words = ["--model.noise.kind", "flow", "--model.kind", "other"]
-    found, rest = flags.take_kinds(words, TINY)
+    found, rest = cli.take_kinds(words, TINY)
     assert (type(found.model), type(found.model.noise).__name__, rest) == (Other, "FlowConfig", [])
     file = tmp_path / "mine.json"
     file.write_text('{"model": {"noise": {"kind": "flow", "shift": 2}, "kind": "other"}}')

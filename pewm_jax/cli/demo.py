@@ -87,11 +87,9 @@ def steps(settings: Settings) -> list[tuple[str, list[str]]]:
 
 
 def ending(run: Path, viewer: bool) -> str:
-    """Return the sentences that say which files to open.
+    """Return the sentences that say which files to open after training in a folder.
 
-    Args:
-        run: the folder of the training.
-        viewer: whether the viewer's dependencies are installed.
+    ``viewer``: whether the viewer's dependencies are installed.
     """
     install = "" if viewer else "pip install 'pewm-jax[play]' && "
     return (

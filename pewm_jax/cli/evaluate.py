@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from pewm_jax import config as configuration
-from pewm_jax import presets, shipped
 from pewm_jax import registry as kinds
+from pewm_jax import shipped
 from pewm_jax.cli import parser
 from pewm_jax.cli import train as training
 from pewm_jax.cli.parser import Flat
-from pewm_jax.config import Config, EvalConfig, Join, World
+from pewm_jax.config import EvalConfig, Join, World
 from pewm_jax.errors import ConfigError
 from pewm_jax.io import runtime
 
@@ -96,18 +97,21 @@ def _read_config(run: Path) -> configuration.Config | None:
     return configuration.load(file) if file.is_file() else None
 
 
+def _given(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that are not None."""
+    return {name: value for name, value in settings.items() if value is not None}
+
+
 def _score_codec(settings: EvaluateSettings) -> None:
     """Print the scores of a codec."""
     from pewm_jax.eval import codec_score
 
-    unsupported = {name: value for name, value in settings.changes().items() if value is not None}
-    unsupported |= {} if settings.out is None else {"out": settings.out}
+    unsupported = _given({**settings.changes(), "out": settings.out})
     chosen = {name: unsupported.pop(name, None) for name in ("data", "split")}
     if unsupported:
         raise ConfigError(
             f"{settings.run} contains a codec, which is evaluated on the frames of --data and "
-            "--split: "
-            f"omit {', '.join('--' + name for name in unsupported)}."
+            f"--split: omit {', '.join('--' + name for name in unsupported)}."
         )
     print(f"numbers: {codec_score.score(settings.run, **chosen)}")
 
@@ -135,43 +139,23 @@ class ProtocolSettings:
 
 def protocol(settings: ProtocolSettings) -> None:
     """Write a protocol file and print its hash."""
-    config = _with_changes(_settings_of(settings.name), settings)
+    config, _ = training.settings_of(settings.name, "preset or run")
+    if not isinstance(config.model, World):
+        raise ConfigError(
+            f"{settings.name} trains no world model, but protocols are for rollouts: use "
+            "`pewm-jax evaluate` without one."
+        )
+    data = {"path": settings.data and str(settings.data), "context": settings.context}
+    config = dataclasses.replace(
+        config,
+        data=dataclasses.replace(config.data, **_given(data)),
+        evaluate=dataclasses.replace(config.evaluate, **_given(vars(settings.chosen))),
+    )
     # Imported lazily: help and errors are fast.
     from pewm_jax.eval import protocol as protocols
 
     protocols.write_protocol(config, settings.out, print)
     print(f"protocol: {settings.out}")
-
-
-def _settings_of(name: str) -> Config:
-    """Return the settings of a preset, a run, shipped weights, or a world of a plugin."""
-    file = shipped.find(name) / "config.json"
-    if name not in presets.names() and file.is_file():
-        config = configuration.load(file)
-    elif name in presets.names():
-        config = presets.load(name)
-    else:
-        config = training.of_world(name, presets.names(), "preset or run")
-    if not isinstance(config.model, World):
-        raise ConfigError(
-            f"{name} trains no world model, but protocols are for rollouts: use "
-            "`pewm-jax evaluate` without one."
-        )
-    return config
-
-
-def _with_changes(config: Config, settings: ProtocolSettings) -> Config:
-    """Return the settings with the given overrides."""
-    unsupported = {
-        name: value for name, value in vars(settings.chosen).items() if value is not None
-    }
-    data = {} if settings.data is None else {"path": str(settings.data)}
-    data |= {} if settings.context is None else {"context": settings.context}
-    return dataclasses.replace(
-        config,
-        data=dataclasses.replace(config.data, **data),
-        evaluate=dataclasses.replace(config.evaluate, **unsupported),
-    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,13 +25,15 @@ class Command:
         settings: ``MODULE:NAME`` of the dataclass of its settings; or of a function that takes its
             arguments and the words it was called by, and returns ``parser.Arguments``. The module
             must import quickly: it is imported for ``--help``.
-        run: ``MODULE:NAME`` of the function that takes the settings and returns an exit code; None
-            is 0. Heavy modules are imported here.
+        run: ``MODULE:NAME`` of the function that takes the settings; an integer that it returns is
+            the exit code, otherwise 0. Heavy modules are imported here.
+        resumes: whether the same command resumes after Ctrl-C, which is printed then.
     """
 
     about: str
     settings: str
     run: str
+    resumes: bool = False
 
 
 CLI, CONVERT = "pewm_jax.cli", "pewm_jax.convert"
@@ -48,23 +50,24 @@ COMMANDS = {
     ),
     "data collect": Command(
         "let an agent walk through houses, or your own environment (--env)",
-        f"{CLI}.data:collect_arguments",
-        f"{CLI}.data:collect",
+        f"{CLI}.main:collect_arguments",
+        f"{CLI}.main:collect",
+        resumes=True,
     ),
     "data import": Command(
         "import a recording: a folder of colour, depth and a trajectory",
         "pewm_jax.data.importer:ImportConfig",
-        f"{CLI}.data:import_recording",
+        "pewm_jax.data.importer:import_recording",
     ),
     "data validate": Command(
         "check a dataset: files, counts, units, poses, geometry",
         "pewm_jax.data.validate:ValidateConfig",
-        f"{CLI}.data:validate",
+        f"{CLI}.main:validate",
     ),
     "data show": Command(
         "draw an episode as a contact sheet and its path from above",
         "pewm_jax.data.show:ShowConfig",
-        f"{CLI}.data:show",
+        "pewm_jax.data.show:show",
     ),
     "train": Command(
         "train a world model, or resume an interrupted training",
@@ -109,7 +112,8 @@ COMMANDS = {
     "memory cache": Command(
         "compute the image encoder's features of every frame once",
         "pewm_jax.memory.feature_cache:CacheConfig",
-        f"{CLI}.data:cache_features",
+        "pewm_jax.memory.feature_cache:cache",
+        resumes=True,
     ),
     "convert import cogvideox": Command(
         "a CogVideoX checkpoint in the layout of diffusers → our layout, or with --rgbd --camera "
@@ -163,37 +167,39 @@ GROUPS = {
 """One-line descriptions of groups of commands."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return the exit code: 0, 1 problems found, 2 bad input, 130 interrupted."""
-    return parser.run(execute, argv)
+def main(argv: Sequence[str] | None = None, called: str = "") -> int:
+    """Run a command and return the exit code: 0, 1 problems found, 2 bad input, 130 interrupted.
+
+    ``called``: the words typed instead of ``pewm-jax`` and the first word.
+    """
+    return parser.run(lambda words: execute(words, called), argv)
 
 
 def deprecated(group: str) -> int:
     """Run a group of commands called as a module and return the exit code."""
     called = f"python -m pewm_jax.{group}"
     print(f"warning: `{called}` is deprecated; use `{PROGRAM} {group}`.", file=sys.stderr)
-    return parser.run(lambda argv: execute([group, *argv], called))
+    return main([group, *sys.argv[1:]], called)
 
 
 def execute(argv: Sequence[str], called: str = "") -> int:
-    """Run a command; errors are raised.
-
-    Args:
-        argv: the words of the command and its arguments.
-        called: the words typed instead of ``pewm-jax`` and the first word.
-
-    Returns:
-        The exit code.
-    """
+    """Run a command and return its exit code; errors are raised. ``called``: as for ``main``."""
     if argv and argv[0] == "--version":
         print(f"{PROGRAM} {pewm_jax.__version__}")
         return 0
-    name, rest = find(plugins.take(argv))
+    name, rest = find(plugins.run(argv))
     if name not in COMMANDS:
         print(usage(name, called))
         return 0 if rest else 2
-    values = read(name, rest, _prog(name, called))
-    return function_of(COMMANDS[name].run)(*values) or 0
+    command, values = COMMANDS[name], read(name, rest, _prog(name, called))
+    try:
+        found = function_of(command.run)(*values)
+    except KeyboardInterrupt as error:
+        if not command.resumes:
+            raise
+        again = "Interrupted; run the same command again to resume."
+        raise KeyboardInterrupt(again) from error
+    return found if isinstance(found, int) else 0
 
 
 def find(argv: Sequence[str]) -> tuple[str, list[str]]:
@@ -262,3 +268,35 @@ def _prog(name: str, called: str) -> str:
     """Return the command as the user typed it."""
     rest = name.partition(" ")[2]
     return f"{called} {rest}".strip() if called else f"{PROGRAM} {name}".strip()
+
+
+def collect_arguments(argv: Sequence[str], prog: str) -> Arguments:
+    """Return the arguments of ``data collect``; with ``--env``, those for a user's environment."""
+    if any(word.split("=")[0] == "--env" for word in argv):
+        from pewm_jax.data.collect_env import CollectEnvConfig
+
+        return Arguments({"settings": (CollectEnvConfig, None)}, hint=f"{prog} --env")
+    from pewm_jax.data.make_episode import CollectConfig
+
+    return Arguments({"settings": (CollectConfig, None)}, renamed={"--voxels": "--voxels.record"})
+
+
+def collect(settings: Any) -> None:
+    """Run ``data collect``."""
+    from pewm_jax.data.make_episode import CollectConfig
+
+    if isinstance(settings, CollectConfig):
+        from pewm_jax.data.collect import collect as collect_houses
+
+        collect_houses(settings)
+    else:
+        from pewm_jax.data.collect_env import collect_env
+
+        collect_env(settings)
+
+
+def validate(settings: Any) -> int:
+    """Run ``data validate``; return 1 if there are problems."""
+    from pewm_jax.data.validate import validate as find_problems
+
+    return 1 if find_problems(settings).problems else 0

@@ -20,16 +20,17 @@ import re
 import sys
 import textwrap
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from pewm_jax.cli.flags import flags_of, full_names, kinds_text, take_kinds
-from pewm_jax.cli.plugins import Plugins
-from pewm_jax.config import Config
-from pewm_jax.config.overlay import overlay
+from pewm_jax import registry
+from pewm_jax.cli.plugins import Plugins, take
+from pewm_jax.config import Config, Settings
+from pewm_jax.config.migrations import RENAMED_FLAGS, RENAMED_SETTINGS, kind_now
+from pewm_jax.config.overlay import overlay, section_with_kinds, with_kind
 from pewm_jax.errors import ConfigError, UserError, report
 
 T = TypeVar("T")
@@ -74,11 +75,9 @@ class Arguments:
 
 
 def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
-    """Run a command; convert errors to an exit code and one sentence on stderr.
+    """Run a command, which returns an exit code (None is 0); convert errors to one and a sentence.
 
-    Args:
-        main: the command; takes the arguments and returns an exit code (None is 0).
-        argv: the arguments, by default those of the process.
+    ``argv`` are by default the arguments of the process.
 
     Returns:
         0; 2 for invalid input and unusable files; 130, or the error's ``exit_code``, for an
@@ -98,14 +97,10 @@ def parse(
     prog: str,
     description: str | None = None,
 ) -> T:
-    """Read one dataclass from flags such as ``--train.stage1.steps 10``.
+    """Read one frozen dataclass from flags such as ``--train.stage1.steps 10``.
 
-    Args:
-        kind: the frozen dataclass to read.
-        argv: the arguments.
-        default: the settings if no flags are given; None for the defaults of the class.
-        prog: the command as the user typed it, for help and error messages.
-        description: the first paragraph of the help text.
+    ``default``: the settings if no flags are given; None for the defaults of the class. ``prog``
+    and ``description``: as for ``read`` and ``Arguments``.
 
     Raises:
         ConfigError: an unknown flag (with the nearest known one), or an invalid value.
@@ -116,10 +111,7 @@ def parse(
 def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
     """Parse a command's arguments; ``--help`` prints every flag with its docstring and exits.
 
-    Args:
-        wanted: the groups of settings.
-        argv: the arguments.
-        prog: the command as the user typed it.
+    ``prog`` is the command as the user typed it, for help and error messages.
 
     Returns:
         The settings of each group, by its name.
@@ -136,8 +128,10 @@ def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
     epilog = wanted.epilog
     for name, (kind, default) in groups.items():
         if isinstance(default, Config):
-            file, flags = _take_config_file(flags)
-            under = default if file is None else overlay(default, file)
+            files, flags = take(flags, lambda flag: flag == "--config")
+            if any(file is None for _, file in files):
+                raise ConfigError("--config needs the name of a JSON file of settings.")
+            under = overlay(default, Path(str(files[0][1]))) if files else default
             config, flags = take_kinds(full_names(flags, under), under)
             groups[name] = kind, config
             extra["file"] = ConfigFile, ConfigFile()
@@ -167,6 +161,102 @@ def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
             print(epilog)
         raise
     return {name: getattr(found, name) for name in groups}
+
+
+def full_names(flags: Sequence[str], default: Any) -> list[str]:
+    """Return flags by their full, current names if what they override is an experiment."""
+    if not isinstance(default, Config):
+        return list(flags)
+    sections = {field.name for field in dataclasses.fields(default)}
+    short = {field.name for field in dataclasses.fields(default.model)} - sections
+
+    def full(flag: str) -> str:
+        if not flag.startswith("--"):
+            return flag
+        name, equals, value = flag[2:].partition("=")
+        name, given = name.replace("-", "_"), flag
+        head, dot, last = name.removeprefix("no_").rpartition(".")
+        if name.startswith("no_") and dot:
+            name = f"{head}.no_{last}"
+            given = f"--{name}{equals}{value}"
+        for old, new in RENAMED_FLAGS:
+            if name == old or (old.endswith((".", "_")) and name.startswith(old)):
+                return f"--{new}{name.removeprefix(old)}{equals}{value}"
+        for old, new in _renamed(default.model).items():
+            if name in (old, f"model.{old}"):
+                return f"--model.{new}{equals}{value}"
+        first = name.partition(".")[0]
+        ours = first in short or first.removeprefix("no_") in short
+        return f"--model.{name}{equals}{value}" if ours else given
+
+    return [full(flag) for flag in flags]
+
+
+def _renamed(model: Any) -> dict[str, str]:
+    """Return earlier names of a world's settings → present names."""
+    fields = {field.name for field in dataclasses.fields(model)}
+    tables = RENAMED_SETTINGS.values()
+    return {old: new for table in tables for old, new in table.items() if new in fields}
+
+
+def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:
+    """Apply ``--SECTION.kind NAME`` and remove it from the arguments, which have their full names.
+
+    Returns:
+        The default with settings of the chosen kinds, which may still be inconsistent, and the
+        other arguments.
+
+    Raises:
+        ConfigError: there is no such kind, or a flag lacks its value.
+    """
+    found, rest = take(flags, lambda flag: flag.startswith("--") and flag.endswith(".kind"))
+    chosen = [(flag.removeprefix("--").split(".")[:-1], name, flag) for flag, name in found]
+    for path, name, flag in sorted(chosen, key=lambda choice: len(choice[0])):
+        section = section_with_kinds(default, path)
+        if section is None:
+            rest.append(flag if name is None else f"{flag}={name}")
+        elif name is None:
+            there = ", ".join(registry.names(section.SECTION))
+            raise ConfigError(f"{flag} needs a value: {there}.")
+        else:
+            default = with_kind(default, path, kind_now(section.SECTION, name))
+    return default, rest
+
+
+def flags_of(settings: Any, prefix: str = "--") -> Iterator[tuple[str, Any]]:
+    """Yield the flags of settings (or of a dataclass type), including nested ones, and fields."""
+    instance = None if isinstance(settings, type) else settings
+    if isinstance(instance, Settings) and prefix != "--":
+        yield f"{prefix}kind", None
+    hints = typing.get_type_hints(type(instance) if instance else settings, include_extras=True)
+    for field in dataclasses.fields(settings):
+        value = registry.default_of(field) if instance is None else getattr(instance, field.name)
+        flat = any(getattr(mark, "name", None) == "" for mark in typing.get_args(hints[field.name]))
+        if flat:
+            yield from flags_of(value, prefix)
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            yield from flags_of(value, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}", field
+
+
+def kinds_text(default: Any, prefix: str = "") -> str:
+    """Return one line per section that has several kinds, for the help text."""
+    lines = []
+    for field in dataclasses.fields(default):
+        value = getattr(default, field.name)
+        if not dataclasses.is_dataclass(value):
+            continue
+        name = f"{prefix}{field.name}"
+        if isinstance(value, Settings):
+            known = registry.names(value.SECTION)
+            if len(known) > 1:
+                lines.append(f"  --{name}.kind {{{','.join(known)}}} ({registry.of(value).name})")
+        below = kinds_text(value, f"{name}.")
+        lines += [below] if below else []
+    if lines and not prefix:
+        lines.insert(0, "Parts of the model with several kinds:")
+    return "\n".join(lines)
 
 
 def _composed(groups: Mapping[str, tuple[type, Any]]) -> type:
@@ -265,24 +355,10 @@ def _joined(flags: Sequence[str], name: str) -> list[str]:
     return [*rest, name, *values] if given else rest
 
 
-def _take_config_file(flags: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """Remove ``--config FILE`` from the arguments."""
-    for index, flag in enumerate(flags):
-        if flag.startswith("--config="):
-            return Path(flag.removeprefix("--config=")), [*flags[:index], *flags[index + 1 :]]
-        if flag == "--config":
-            if index + 1 == len(flags):
-                raise ConfigError("--config needs the name of a JSON file of settings.")
-            return Path(flags[index + 1]), [*flags[:index], *flags[index + 2 :]]
-    return None, list(flags)
-
-
 def optional(kind: type, *names: str) -> type:
-    """Return a dataclass with fields of another one, each None by default.
+    """Return a dataclass with some fields of another one, each None by default.
 
-    Args:
-        kind: the dataclass; its types and docstrings are those of the flags.
-        names: names of the fields, in the order of the help.
+    Types and docstrings are those of the dataclass; the order of the names is that of the help.
     """
     hints = typing.get_type_hints(kind, include_extras=True)
     texts = _field_docs(kind)
@@ -314,11 +390,7 @@ def _field_docs(kind: type) -> dict[str, str]:
 
 
 def choose(name: str, known: Sequence[str], what: str) -> str:
-    """Return ``name`` if it is known.
-
-    Raises:
-        ConfigError: it is unknown; the message lists the known names and suggests the nearest.
-    """
+    """Return ``name`` if it is known, or raise ConfigError with the known names and the nearest."""
     if name in known:
         return name
     raise ConfigError(

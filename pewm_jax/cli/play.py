@@ -51,12 +51,11 @@ def run(settings: Settings) -> None:
     from pewm_jax.play import page as pages
     from pewm_jax.play import serving
 
-    serve, start = _part(Serve, settings), _part(Start, settings)
     home = shipped.home(model)
-    _require_usable(model, start, settings.worlds)
+    _require_usable(settings)
     folder = settings.worlds or home / "worlds"
     name, say = Path(model).name, functools.partial(print, flush=True)
-    page = pages.Page(lambda: _load(model, home), start, serve, folder, name, say)
+    page = pages.Page(lambda: _load(model, home), settings, settings, folder, name, say)
     try:
         if settings.open:
             serving.open_in_browser(page.url)
@@ -67,7 +66,7 @@ def run(settings: Settings) -> None:
         page.close()
 
 
-def _require_usable(name: str, start: Start, worlds: Path | None) -> None:
+def _require_usable(settings: Settings) -> None:
     """Raise errors before the page opens: missing model, unusable start, unwritable folder.
 
     Weights are memory-mapped and not read.
@@ -76,12 +75,12 @@ def _require_usable(name: str, start: Start, worlds: Path | None) -> None:
     from pewm_jax.play import places
     from pewm_jax.worlds.rollouts import load_finished
 
-    run = shipped.find(name)
+    run, worlds = shipped.find(settings.model), settings.worlds
     clip = configuration.load(run / "config.json").model.clip
     if (run / "weights.safetensors").is_file():
-        load_finished(name, lazily=True)
-    if start.scene or start.episode or start.recording:
-        places.open_place(start, clip.height, clip.width)
+        load_finished(settings.model, lazily=True)
+    if settings.scene or settings.episode or settings.recording:
+        places.open_place(settings, clip.height, clip.width)
     if worlds is not None:
         there = next(path for path in (worlds, *worlds.absolute().parents) if path.exists())
         if not there.is_dir() or not os.access(there, os.W_OK):
@@ -97,8 +96,3 @@ def _load(name: str, home: Path):
 
     runtime.cache_compilation(home.parent)
     return open_engine(Path(name).name, *load(name))
-
-
-def _part(kind: type, settings: Settings):
-    """Return the settings of one part."""
-    return kind(**{field.name: getattr(settings, field.name) for field in dataclasses.fields(kind)})

@@ -6,7 +6,7 @@ import dataclasses
 import importlib.util
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pewm_jax import registry as kinds
@@ -22,13 +22,10 @@ class Plugins:
     repeated."""
 
 
-def take(argv: Sequence[str]) -> list[str]:
+def run(argv: Sequence[str]) -> list[str]:
     """Import the files given by ``--plugin``, and the modules given by the deprecated ``--import``.
 
     Modules are also looked up in the current folder, after all other locations.
-
-    Args:
-        argv: the arguments; the flags may be repeated.
 
     Returns:
         The other arguments.
@@ -36,15 +33,9 @@ def take(argv: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: a flag has no value, or a file or module cannot be imported.
     """
-    rest, queue = [], list(argv)
-    while queue:
-        word = queue.pop(0)
-        flag, equals, name = word.partition("=")
-        if flag not in ("--import", "--plugin"):
-            rest.append(word)
-            continue
-        if not equals:
-            name = queue.pop(0) if queue else ""
+    found, rest = take(argv, lambda flag: flag in ("--import", "--plugin"))
+    for flag, value in found:
+        name = value or ""
         if flag == "--plugin":
             load_file(name)
             continue
@@ -58,6 +49,22 @@ def take(argv: Sequence[str]) -> list[str]:
         look_here()
         kinds.imported(name, "--import")
     return rest
+
+
+def take(
+    argv: Sequence[str], wanted: Callable[[str], bool]
+) -> tuple[list[tuple[str, str | None]], list[str]]:
+    """Split arguments into the wanted flags with their values, None if missing, and the others."""
+    found: list[tuple[str, str | None]] = []
+    rest, queue = [], list(argv)
+    while queue:
+        word = queue.pop(0)
+        flag, equals, value = word.partition("=")
+        if wanted(flag):
+            found.append((flag, value if equals else queue.pop(0) if queue else None))
+        else:
+            rest.append(word)
+    return found, rest
 
 
 def load_file(name: str) -> None:

@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from pewm_jax import config as configuration
-from pewm_jax import presets, registry
+from pewm_jax import presets, registry, shipped
 from pewm_jax.cli import parser
 from pewm_jax.cli.parser import Arguments, Flat
 from pewm_jax.config import Config, Launch, World
@@ -60,29 +60,30 @@ def arguments(argv: Sequence[str], prog: str) -> Arguments:
         return Arguments(chosen, ABOUT[command], _epilog(prog, EXAMPLES[command]))
     if not argv or argv[0].startswith("-"):
         raise ConfigError(f"Give a preset first: {prog} demo ({', '.join(known)}).")
-    name, folder = argv[0], Path(argv[0])
+    name = argv[0]
+    default, about = settings_of(name, "preset")
+    folder = shipped.find(name)
     if name not in known and (folder / "config.json").is_file():
-        default, about = _settings_in(folder), f"The settings in {folder}."
-    elif name in known:
-        default, about = presets.load(name), presets.describe(name)
-    else:
-        default = of_world(name, known, "preset")
-        about = f"The world {name}, with its own defaults."
+        default = _starting_from(folder, default)
     groups = {**chosen, "config": (type(default), default)}
     return Arguments(groups, about, hint=f"{prog} {name}")
 
 
-def of_world(name: str, known: Sequence[str], what: str) -> Config:
-    """Return the own defaults of a world that a plugin or an installed package registers.
+def settings_of(name: str, what: str) -> tuple[Config, str]:
+    """Return the settings with a name, and what they are.
 
-    Args:
-        name: the world's.
-        known: what else could have been meant, for the message.
-        what: what these are.
+    It names a preset; the folder of a run or of weights, or weights that ship with the library; or
+    a world that a plugin or an installed package registers. ``what`` describes the first ones, for
+    the message.
 
     Raises:
-        ConfigError: there is no such world.
+        ConfigError: nothing has this name.
     """
+    known, file = presets.names(), shipped.find(name) / "config.json"
+    if name in known:
+        return presets.load(name), presets.describe(name)
+    if file.is_file():
+        return configuration.load(file), f"The settings in {Path(name)}."
     try:
         world = registry.named("world", name).settings
     except ConfigError as error:
@@ -91,7 +92,7 @@ def of_world(name: str, known: Sequence[str], what: str) -> Config:
         except ConfigError as first:
             raise ConfigError(f"{first} {error}") from None
         raise
-    return Config(model=world(), train=world.TRAIN())
+    return Config(model=world(), train=world.TRAIN()), f"The world {name}, with its own defaults."
 
 
 def run(chosen: Chosen, config: Config) -> None:
@@ -121,15 +122,8 @@ def run(chosen: Chosen, config: Config) -> None:
 def plan(chosen: Chosen, config: Config) -> None:
     """Print the predicted memory and time of a training on other hardware."""
     from pewm_jax.plan import plan as planning
-    from pewm_jax.plan import target_plan
 
-    launch = dataclasses.replace(chosen.launch, plan=True)
-    if launch.compiler == "target":
-        target_plan.show(config, launch)
-        return
-    plans = planning.show(config, launch)
-    if launch.json:
-        target_plan.write(Path(launch.json), [target_plan.estimate(plan) for plan in plans])
+    planning.show(config, dataclasses.replace(chosen.launch, plan=True))
 
 
 def _epilog(prog: str, examples: Sequence[str]) -> str:
@@ -140,12 +134,11 @@ def _epilog(prog: str, examples: Sequence[str]) -> str:
     return "\n".join(["Presets:", *lines, "", "Examples:", *called, "", more])
 
 
-def _settings_in(folder: Path) -> Config:
+def _starting_from(folder: Path, config: Config) -> Config:
     """Return the settings in a folder of weights, for training from those weights.
 
     A run's own folder keeps its original start weights: the same command resumes it.
     """
-    config = configuration.load(folder / "config.json")
     if Path(config.train.run).resolve() == folder.resolve():
         return config
     return dataclasses.replace(config, train=dataclasses.replace(config.train, start=str(folder)))

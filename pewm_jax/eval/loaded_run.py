@@ -10,7 +10,7 @@ from pewm_jax import shipped
 from pewm_jax.config import Config, UserError
 from pewm_jax.io import weights
 from pewm_jax.io.store import file_hash
-from pewm_jax.train import stages
+from pewm_jax.train import runs
 from pewm_jax.types import Params
 from pewm_jax.worlds import require_world
 from pewm_jax.worlds.rollouts import load_finished
@@ -45,7 +45,7 @@ class LoadedRun:
         last, done = int(facts.get("stage", 0)), int(facts.get("step", 0))
         return {
             stage.name: stage.settings(self.config).steps if stage.number < last else done
-            for stage in stages.all_stages(self.config)
+            for stage in runs.all_stages(self.config)
             if stage.number <= last
         }
 
@@ -90,7 +90,7 @@ def has_memory(loaded: LoadedRun) -> bool:
     Raises:
         UserError: training is not finished.
     """
-    known = stages.all_stages(loaded.config)
+    known = runs.all_stages(loaded.config)
     asked = [stage for stage in known if stage.memory and stage.settings(loaded.config).steps > 0]
     can = loaded.config.model.capabilities
     if not can.memory_parameters:
@@ -109,7 +109,7 @@ def has_memory(loaded: LoadedRun) -> bool:
 
 def _require_all_steps(loaded: LoadedRun) -> None:
     """Raise an error if a stage was trained for fewer steps than configured."""
-    for stage in stages.all_stages(loaded.config):
+    for stage in runs.all_stages(loaded.config):
         wanted = stage.settings(loaded.config).steps
         done = loaded.steps.get(stage.name, wanted if not loaded.steps else 0)
         if done < wanted:
@@ -175,7 +175,7 @@ def open_none(loaded: LoadedRun, config: Config) -> LoadedRun | None:
 
 def _flags_for(loaded: LoadedRun, steps: int) -> str:
     """Return the flags that train a world for as many steps without its memory, in brackets."""
-    known = [stage for stage in stages.all_stages(loaded.config) if not stage.optional]
+    known = [stage for stage in runs.all_stages(loaded.config) if not stage.optional]
     alone = next((stage for stage in known if not stage.memory), None)
     if alone is None:
         return ""
@@ -196,13 +196,13 @@ def none_facts(none: LoadedRun, loaded: LoadedRun) -> dict[str, Any]:
 
 def _total_steps(loaded: LoadedRun) -> int:
     """Return the number of steps of all stages: those done, or those planned if unknown."""
-    planned = [stage.settings(loaded.config).steps for stage in stages.all_stages(loaded.config)]
+    planned = [stage.settings(loaded.config).steps for stage in runs.all_stages(loaded.config)]
     return sum(loaded.steps.values() or planned)
 
 
 def _steps_without_memory(loaded: LoadedRun) -> int:
     """Return the number of steps of the stages that train the model without its memory."""
-    known = {stage.name: stage for stage in stages.all_stages(loaded.config)}
+    known = {stage.name: stage for stage in runs.all_stages(loaded.config)}
     return sum(steps for name, steps in loaded.steps.items() if not known[name].memory)
 
 

@@ -17,9 +17,9 @@ from pewm_jax.eval.runner import ModelRunner, print_now
 from pewm_jax.io import atomic
 from pewm_jax.report.pictures import as_bytes, farthest, grid, save_png
 from pewm_jax.report.video import encode_h264, side_by_side
-from pewm_jax.train.stages import Stage
 from pewm_jax.train.watch import IMAGINED, Preview, Previewed
 from pewm_jax.types import Frames, Params
+from pewm_jax.worlds.stages import Stage
 
 SPLIT, CLIPS, SHOWN = "validation", 8, 3
 """The split of previews, the number of scored clips, and the number of displayed clips."""

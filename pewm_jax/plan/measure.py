@@ -7,9 +7,12 @@ jaxprs give the FLOPs (``train.flops``). The compiled program gives memory and c
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -18,11 +21,12 @@ from jax.sharding import AbstractMesh, Mesh
 
 from pewm_jax.config import AXES, Config, UserError
 from pewm_jax.data import abstract
-from pewm_jax.plan import hlo
+from pewm_jax.plan import program
+from pewm_jax.plan.program import Collective, Program
 from pewm_jax.train import flops, sharding, step
 from pewm_jax.train.chips import Chip
 from pewm_jax.train.flops import Work
-from pewm_jax.train.stages import Stage
+from pewm_jax.worlds.stages import Stage
 
 QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 """Compiler options that save time. They affect only the generated machine code, which is never
@@ -58,20 +62,49 @@ class MeshSizes:
         """Return a mesh without devices."""
         return AbstractMesh(tuple(self.sizes.values()), tuple(self.sizes))
 
+    @functools.cached_property
+    def groups(self) -> dict[tuple[int, ...], str]:
+        """Return the axes along which each group of devices lies, joined by ``+``."""
+        split = [name for name, size in self.sizes.items() if size > 1]
+        places = np.arange(self.devices).reshape(tuple(self.sizes.values()))
+        found: dict[tuple[int, ...], str] = {}
+        for count in range(1, len(split) + 1):
+            for axes in itertools.combinations(split, count):
+                moved = np.moveaxis(places, [AXES.index(axis) for axis in axes], range(-count, 0))
+                rows = moved.reshape(-1, math.prod(self.sizes[axis] for axis in axes))
+                for group in np.sort(rows).tolist():
+                    found.setdefault(tuple(group), "+".join(axes))
+        return found
+
+    def axes_of(self, group: tuple[int, ...]) -> str:
+        """Return the axes along which devices communicate: all along them, or some of these."""
+        exact = self.groups.get(tuple(sorted(group)))
+        around = [axes for whole, axes in self.groups.items() if set(group) <= set(whole)]
+        if exact or len(group) != 2 or not around:  # a permutation names pairs
+            return exact or "other"
+        return min(around, key=lambda axes: axes.count("+"))
+
+    def sent(self, collectives: Iterable[Collective]) -> dict[tuple[str, str], float]:
+        """Return the bytes that a device sends, by (kind, axes of the mesh)."""
+        sent = defaultdict[tuple[str, str], float](float)
+        for item in collectives:
+            sent[item.kind, self.axes_of(item.group)] += item.sent
+        return {key: size for key, size in sorted(sent.items()) if size}
+
 
 @dataclasses.dataclass(frozen=True)
 class Compiled:
     """What the compiler reports about a step on virtual CPU devices; bytes are per device.
 
     Attributes:
-        program: its products and communication.
+        program: its work.
         arguments: bytes of state and batch.
         temporary: bytes of temporary memory and new outputs.
         mesh: the mesh for which it was compiled.
         seconds: time of compilation.
     """
 
-    program: hlo.Program
+    program: Program
     arguments: float
     temporary: float
     mesh: MeshSizes
@@ -84,14 +117,11 @@ class Compiled:
 
     def sent_along(self, axis: str) -> dict[str, float]:
         """Return kind → bytes that a device sends to devices that differ only along this axis."""
-        places = np.arange(self.mesh.devices).reshape(tuple(self.mesh.sizes.values()))
-        lines = np.moveaxis(places, AXES.index(axis), -1).reshape(-1, self.mesh.sizes[axis])
-        groups = {tuple(sorted(line)) for line in lines.tolist()}
-        sent: dict[str, float] = {}
+        sent = defaultdict[str, float](float)
         for item in self.program.collectives:
-            if len(item.group) > 1 and tuple(sorted(item.group)) in groups:
-                sent[item.kind] = sent.get(item.kind, 0.0) + item.sent
-        return sent
+            if self.mesh.groups.get(tuple(sorted(item.group))) == axis:
+                sent[item.kind] += item.sent
+        return dict(sent)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,11 +158,7 @@ class StepWork:
 
 
 def virtual(count: int) -> Sequence[Any]:
-    """Return virtual CPU devices; call it before JAX uses any device.
-
-    Raises:
-        UserError: JAX already uses devices, but too few.
-    """
+    """Return virtual CPU devices; call it before JAX uses any device, or UserError is raised."""
     try:
         jax.config.update("jax_platforms", "cpu")
         jax.config.update("jax_num_cpu_devices", count)
@@ -142,21 +168,13 @@ def virtual(count: int) -> Sequence[Any]:
     if len(devices) < count:
         raise UserError(
             f"A plan for {count} devices needs a process in which JAX has not been used, but here "
-            "it "
-            f"uses {len(devices)} already: run `python train.py … --plan`."
+            f"it uses {len(devices)} already: run `python train.py … --plan`."
         )
     return devices[:count]
 
 
 def work_of(config: Config, stage: Stage, traced: jax.stages.Traced, chip: Chip | None) -> StepWork:
-    """Count the work of a stage's step.
-
-    Args:
-        config: the experiment.
-        stage: the stage.
-        traced: from ``trace``.
-        chip: the target chip; None for a CPU.
-    """
+    """Count the work of a stage's step, traced by ``trace``, on a chip (None: a CPU)."""
     config = as_on_chips(config)
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
     given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
@@ -174,12 +192,7 @@ def trace(config: Config, stage: Stage, devices: Sequence[Any]) -> jax.stages.Tr
 
 
 def compile_traced(traced: jax.stages.Traced, mesh: Mesh | MeshSizes) -> Compiled:
-    """Compile a traced step, and measure the program.
-
-    Args:
-        traced: from ``trace``.
-        mesh: the mesh for which it was traced, or its sizes.
-    """
+    """Compile a step that ``trace`` traced for a mesh, or its sizes, and measure the program."""
     began = time.monotonic()
     compiled = traced.lower().compile(compiler_options=QUICK)
     text = compiled.as_text()
@@ -187,7 +200,7 @@ def compile_traced(traced: jax.stages.Traced, mesh: Mesh | MeshSizes) -> Compile
         raise UserError("This JAX does not return the text of a program; use 0.10 or newer.")
     arguments, temporary = device_memory(compiled)
     return Compiled(
-        program=hlo.read(text),
+        program=program.read(text),
         arguments=arguments,
         temporary=temporary,
         mesh=MeshSizes(**{name: mesh.shape[name] for name in AXES})

@@ -1,28 +1,36 @@
-"""Plan a training run on absent hardware: ``python train.py PRESET --plan``.
+"""Plan a training run on absent hardware: ``pewm-jax plan PRESET``.
 
-The real step is traced and compiled for the requested number of virtual CPU devices, from shapes
-alone: no data is read, no weights are created, no folder is written. ``measure`` determines the
-computation, memory and communication of the step, ``suggest`` predicts time and memory on the chip.
-A network without scanned blocks gives a program so large that compiling it takes too long for a
-plan; then temporary memory is unknown.
+The real step is traced and compiled from shapes alone: no data is read, no weights are created, no
+folder is written. ``--compiler target`` uses the chip's own compiler (``target_compiler``).
+``--compiler cpu`` compiles for the requested number of virtual CPU devices: ``measure`` determines
+the computation, memory and communication of the step, ``suggest`` predicts time and memory on the
+chip. A network without scanned blocks gives a program so large that compiling it takes too long for
+a plan; then temporary memory is unknown.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import jax
 
-from pewm_jax.config import Config, Launch
-from pewm_jax.io import tree
-from pewm_jax.plan import hlo, measure, suggest
+from pewm_jax import __version__
+from pewm_jax.config import Config, Launch, UserError
+from pewm_jax.io import atomic, tree
+from pewm_jax.plan import measure, suggest, target_compiler, topology
 from pewm_jax.plan.measure import Compiled, MeshSizes, virtual
+from pewm_jax.plan.program import COLLECTIVES
 from pewm_jax.plan.suggest import Arrangement
-from pewm_jax.train import chips, sharding, stages
+from pewm_jax.plan.target_compiler import StageReport
+from pewm_jax.train import chips, runs, sharding
 from pewm_jax.train.chips import Chip
 from pewm_jax.train.log import duration
-from pewm_jax.train.stages import Stage
+from pewm_jax.worlds.stages import Stage
 
 MOST_ARRAYS = 1000
 """Number of trained parameter arrays above which `--compiled auto` does not compile. Each array has
@@ -39,6 +47,16 @@ MEMORY = (
     ("activations and other temporary memory", "temporary"),
 )
 """Label and ``Memory`` field of each line in the memory table."""
+COMPILED_MEMORY = (
+    ("state and batch", "argument_bytes"),
+    ("temporary memory", "temporary_bytes"),
+    ("results", "output_bytes"),
+    ("of these in the memory of the state", "alias_bytes"),
+    ("peak", "peak_bytes"),
+)
+"""Label and ``StageReport`` field of each line in the memory table of a chip's compiler."""
+ESTIMATED = "Estimated from formulas and a program for CPUs; mfu is that of the predicted step."
+"""What is uncertain about the numbers of a plan without the chip's compiler."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +67,7 @@ class StagePlan:
         config: the experiment.
         stage: the stage.
         chip: the kind of device.
-        choice: the requested arrangement, with its memory and time.
+        choice: the requested arrangement.
         compiled: the compiler's report; None if the step was not compiled.
         best: the best arrangements.
     """
@@ -62,58 +80,130 @@ class StagePlan:
     best: tuple[Arrangement, ...]
 
 
-def show(config: Config, launch: Launch, log: Callable[[str], None] = print) -> list[StagePlan]:
-    """Plan all stages that have steps, and print the plans.
+def show(
+    config: Config, launch: Launch, log: Callable[[str], None] = print
+) -> list[StagePlan | StageReport]:
+    """Plan all stages that have steps, print the plans and write them to ``launch.json``, if set.
 
     Args:
         config: the experiment.
-        launch: number and kind of devices.
+        launch: number and kind of devices, and the compiler.
         log: prints a line.
+
+    Returns:
+        A ``StageReport`` of each stage with the chip's compiler, otherwise a ``StagePlan``.
 
     Raises:
         ConfigError: the chip is unknown, or the mesh does not fit the devices or the batch.
-        UserError: JAX already uses devices, but too few.
+        UserError: the file cannot be written; JAX already uses devices, but too few; or the chip's
+            compiler is not installed, or fails.
     """
-    chip = chips.named(launch.chip)
+    file = Path(launch.json) if launch.json else None
+    if file is not None:
+        _require_writable(file)
+    chip, on_target = chips.named(launch.chip), launch.compiler == "target"
+    if on_target:
+        topology.require_compiler(chip)
     sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
-    planned = stages.planned(config)
+    planned = runs.planned(config)
     for stage in planned:
         sharding.require_divisible(config, stage, sizes.abstract)
-    virtual(launch.devices)
-    plans = []
+    if not on_target:
+        virtual(launch.devices)
+    plan_one = _plan_on_target if on_target else _plan_on_cpu
+    plans: list[StagePlan | StageReport] = []
     for stage in planned:
-        wanted = _should_compile(config, stage, launch)
-        if wanted:
-            log(f"{stage.title}: compiling the real step for {launch.devices} devices …")
-        plan = plan_stage(config, stage, sizes, chip, compiles=wanted)
-        if plan.compiled is not None:
-            log(f"{stage.title}: compiled in {plan.compiled.seconds:.0f} s")
-        else:
-            log(f"{stage.title}: not compiled, so temporary memory is unknown ({_why(launch)})")
-        plans.append(plan)
-        for line in lines(plan):
+        found, printed = plan_one(config, stage, sizes, chip, launch, log)
+        plans.append(found)
+        for line in printed:
             log(line)
+        if file is not None:
+            _write(file, plans)
     return plans
+
+
+def _require_writable(file: Path) -> None:
+    """Raise an error before hours of compilation if a file cannot be written."""
+    try:
+        if file.is_dir():
+            raise UserError(f"--json {file} is a folder: choose the name of a file.")
+        with tempfile.TemporaryFile(dir=file.parent):
+            pass
+    except OSError as error:
+        raise UserError(
+            f"--json {file} cannot be written ({error.strerror}): choose another file."
+        ) from None
+
+
+def _write(file: Path, plans: Sequence[StagePlan | StageReport]) -> None:
+    """Write plans as JSON, atomically."""
+    reports = (estimate(plan) if isinstance(plan, StagePlan) else plan for plan in plans)
+    values = {"version": __version__, "stages": [dataclasses.asdict(one) for one in reports]}
+    atomic.write_text(file, json.dumps(values, indent=2) + "\n")
+
+
+def _plan_on_target(
+    config: Config, stage: Stage, sizes: MeshSizes, chip: Chip, launch: Launch, log: Any
+) -> tuple[StageReport, Iterator[str]]:
+    """Return what a chip's compiler says about a stage, and its lines."""
+    log(f"{stage.title}: compiling the real step for {sizes.devices} × {chip.name} …")
+    report = target_compiler.compile_stage(config, stage.name, chip, launch.devices)
+    return report, report_lines(report, stage.title, stage.settings(config).batch)
+
+
+def _plan_on_cpu(
+    config: Config, stage: Stage, sizes: MeshSizes, chip: Chip, launch: Launch, log: Any
+) -> tuple[StagePlan, Iterator[str]]:
+    """Return the plan of a stage from formulas and a program for CPUs, and its lines."""
+    wanted = _should_compile(config, stage, launch)
+    if wanted:
+        log(f"{stage.title}: compiling the real step for {sizes.devices} devices …")
+    plan = plan_stage(config, stage, sizes, chip, compiles=wanted)
+    if plan.compiled is not None:
+        log(f"{stage.title}: compiled in {plan.compiled.seconds:.0f} s")
+    else:
+        log(f"{stage.title}: not compiled, so temporary memory is unknown ({_why(launch)})")
+    return plan, lines(plan)
 
 
 def plan_stage(
     config: Config, stage: Stage, sizes: MeshSizes, chip: Chip, *, compiles: bool = True
 ) -> StagePlan:
-    """Plan one stage.
+    """Plan one stage on the requested mesh.
 
-    Args:
-        config: the experiment.
-        stage: the stage.
-        sizes: the requested mesh.
-        chip: the kind of device.
-        compiles: whether to compile the step, for temporary memory and communication.
+    ``compiles``: whether to compile the step, for temporary memory and communication.
     """
     traced = measure.trace(config, stage, virtual(sizes.devices))
     compiled = measure.compile_traced(traced, sizes) if compiles else None
     work = measure.work_of(config, stage, traced, chip)
-    choice = suggest.assess(config, stage, sizes, chip, work, compiled)
-    best = suggest.rank(config, stage, sizes, chip, work, compiled)[:3]
-    return StagePlan(config, stage, chip, choice, compiled, tuple(best))
+    job = suggest.Job(config, stage, chip, work, compiled)
+    best = job.rank(sizes.devices, sizes.context)[:3]
+    return StagePlan(config, stage, chip, job.assess(sizes), compiled, tuple(best))
+
+
+def estimate(plan: StagePlan) -> StageReport:
+    """Return the numbers of a stage that was not compiled for its chip, as a report."""
+    choice, compiled = plan.choice, plan.compiled
+    memory, time, count = choice.memory, choice.time, choice.mesh.devices
+    known = memory.temporary is not None
+    return StageReport(
+        name=plan.stage.name,
+        chip=plan.chip.name,
+        devices=count,
+        mesh=choice.mesh.sizes,
+        compiler={"name": "XLA for CPUs", "version": jax.__version__},
+        argument_bytes=memory.state,
+        temporary_bytes=memory.peak - memory.state if known else None,
+        peak_bytes=memory.peak if known else None,
+        capacity_bytes=plan.chip.memory,
+        fits=choice.fits,
+        flops_needed=time.needed_flops / count,
+        flops_executed=time.executed_flops,
+        collectives=target_compiler.sent_by_axes(time.sent),
+        mfu=time.mfu,
+        compile_s=compiled.seconds if compiled else 0.0,
+        notes=[ESTIMATED],
+    )
 
 
 def _should_compile(config: Config, stage: Stage, launch: Launch) -> bool:
@@ -140,7 +230,8 @@ def lines(plan: StagePlan) -> Iterator[str]:
     yield ""
     yield (
         f"{plan.stage.title.capitalize()} on {choice.mesh.devices} × {plan.chip.name}: "
-        f"{arranged(choice)}; {clips} clips per step, {clips / choice.mesh.batch:g} per device"
+        f"{arranged(choice.mesh.sizes)}; {clips} clips per step, "
+        f"{clips / choice.mesh.batch:g} per device"
     )
     yield "  memory of a device"
     for label, name in MEMORY:
@@ -165,7 +256,7 @@ def lines(plan: StagePlan) -> Iterator[str]:
     yield done if compiled is None else f"{done} (compiled program: {flop(compiled.program.flops)})"
     sent = "  sent by a device in a step"
     yield sent if compiled is None else f"{sent} (compiled program, in 32 bits)"
-    for kind in hlo.KINDS:
+    for kind in COLLECTIVES:
         expected = time.sent_of(kind)
         counted = 0.0 if compiled is None else compiled.program.sent(kind)
         if expected or counted:
@@ -186,9 +277,50 @@ def lines(plan: StagePlan) -> Iterator[str]:
         )
 
 
-def arranged(choice: Arrangement) -> str:
-    """Format an arrangement: ``data 8 × fsdp 8 × tensor 1 × context 1``."""
-    return " × ".join(f"{name} {count}" for name, count in choice.mesh.sizes.items())
+def report_lines(report: StageReport, title: str, clips: int) -> Iterator[str]:
+    """Yield the lines of a chip's compiler's report, for the terminal."""
+    yield ""
+    yield (
+        f"{title.capitalize()} on {report.devices} × {report.chip}: {arranged(report.mesh)}; "
+        f"{clips} clips a step"
+    )
+    compiler = report.compiler
+    yield (
+        f"  compiled by {compiler['name']} {compiler['version']} in {duration(report.compile_s)}, "
+        f"after {duration(report.trace_s)} of tracing"
+    )
+    yield "  memory of a device"
+    for label, name in COMPILED_MEMORY:
+        value = getattr(report, name)
+        yield f"    {label:<42}{'unknown' if value is None else gib(value):>12}"
+    needed = gib(report.peak_bytes) if report.peak_bytes is not None else "more"
+    verdict = "fits" if report.fits else "does not fit"
+    yield f"    {verdict}: {needed} of {gib(report.capacity_bytes)}"
+    if report.refusal:
+        yield f"    the compiler refused it: {report.refusal}"
+    yield "  work of a device in a step"
+    yield f"    {'needed':<42}{flop(report.flops_needed):>12}"
+    yield f"    {'executed, with recomputation and padding':<42}{flop(report.flops_executed):>12}"
+    if report.bytes is not None:
+        yield f"    {'read from and written to memory':<42}{size(report.bytes):>12}"
+    for kind, kernels in report.kernels.items():
+        named = ", ".join(f"{name} × {count:,}" for name, count in kernels.items())
+        yield f"    {kind} kernels: {named}"
+    for item in report.collectives:
+        label = f"{item['kind']} along {item['axis']}, sent"
+        yield f"    {label:<42}{size(item['bytes']):>12}"
+    if report.roofline_s is not None and report.mfu is not None:
+        yield (
+            f"  at best {duration(report.roofline_s)} a step, bound by {report.bound}: MFU "
+            f"{report.mfu:.1%}, {rate(clips / report.roofline_s)} clips/s"
+        )
+    for note in report.notes:
+        yield f"  {note}"
+
+
+def arranged(sizes: Mapping[str, int]) -> str:
+    """Format the sizes of a mesh: ``data 8 × fsdp 8 × tensor 1 × context 1``."""
+    return " × ".join(f"{name} {count}" for name, count in sizes.items())
 
 
 def size(count: float) -> str:
@@ -215,3 +347,10 @@ def rate(count: float) -> str:
 def _short(value: float) -> str:
     """Format a number with three digits, or with all digits before the point."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def gib(count: float) -> str:
+    """Format a number of bytes in GiB or MiB."""
+    if count >= 2**30:
+        return f"{count / 2**30:.2f} GiB"
+    return f"{count / 2**20:.2f} MiB"

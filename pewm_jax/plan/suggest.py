@@ -15,17 +15,16 @@ import math
 from collections.abc import Iterator, Mapping
 
 import jax
-import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import AXES, Config
+from pewm_jax.config import Config
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
 from pewm_jax.plan.measure import Compiled, MeshSizes, StepWork, in_bfloat16
 from pewm_jax.train import sharding
 from pewm_jax.train.chips import Chip
-from pewm_jax.train.stages import Stage
 from pewm_jax.train.step import TrainState, create
+from pewm_jax.worlds.stages import Stage
 
 MARGIN = 0.9
 """Fraction of the memory that a plan may use; the runtime and fragmentation need the rest."""
@@ -109,13 +108,9 @@ class Prediction:
 
 @dataclasses.dataclass(frozen=True)
 class Arrangement:
-    """A device mesh, with its memory and time for a stage.
+    """A device mesh, with the memory and time of a stage on it.
 
-    Attributes:
-        mesh: the number of devices along each axis.
-        memory: memory of one device.
-        time: predicted time of a step.
-        fits: whether the memory suffices, as far as known.
+    ``fits`` says whether the memory suffices, as far as known.
     """
 
     mesh: MeshSizes
@@ -175,15 +170,9 @@ def memory_of(
 ) -> Memory:
     """Return the memory of one device.
 
-    Temporary memory beyond the gradients is that of the compiled program, scaled to a device's
-    share of the batch, heads and tokens. In bfloat16 it is half of the CPU's, which computes in
-    float32.
-
-    Args:
-        config: the experiment.
-        stage: the stage.
-        mesh: the device mesh.
-        compiled: the program compiled for a mesh, which may be another one.
+    Temporary memory beyond the gradients is that of the program compiled for a mesh, which may be
+    another one, scaled to a device's share of the batch, heads and tokens. In bfloat16 it is half
+    of the CPU's, which computes in float32.
     """
     shapes = abstract_state(config, stage)
     placed = sharding.of_state(config.model, mesh.abstract, shapes)
@@ -225,88 +214,107 @@ def _on_device(leaf: jax.ShapeDtypeStruct, where: jax.sharding.NamedSharding, me
     return leaf.size * leaf.dtype.itemsize / ways
 
 
-def predict(
-    config: Config,
-    stage: Stage,
-    mesh: MeshSizes,
-    chip: Chip,
-    work: StepWork,
-    compiled: Compiled | None = None,
-) -> Prediction:
-    """Predict the time of a stage's step on a chip; arguments as for ``assess``."""
-    clips, done = stage.settings(config).batch, work.on_device(mesh)
-    peak = chip.flops if config.model.dtype == "bfloat16" else chip.flops / 2
-    products_s = sum(flops / (peak * REACHED[kind]) for kind, flops in done.items())
-    streamed = work.traffic_on_device(mesh)
-    streamed += OPTIMIZER * FLOAT * counts(config, stage)["trained"].on(mesh)
-    streaming_s = streamed / (chip.bandwidth * STREAMED)
-    sent = traffic(config, stage, mesh, work, compiled)
-    seconds = {key: size / _rate(mesh, key[1], chip) for key, size in sent.items()}
-    blocking = sum(s for (_, axis), s in seconds.items() if axis in SPLIT)
-    overlapping = sum(s for (_, axis), s in seconds.items() if axis not in SPLIT)
-    busy = products_s + streaming_s
-    waiting_s = blocking + max(0.0, overlapping - busy)
-    step_s = busy + waiting_s
-    return Prediction(
-        products_s=products_s,
-        streaming_s=streaming_s,
-        sent=sent,
-        waiting_s=waiting_s,
-        step_s=step_s,
-        needed_flops=work.needed.total,
-        executed_flops=sum(done.values()),
-        mfu=work.needed.total / (step_s * chip.flops * mesh.devices),
-        clips_per_s=clips / step_s,
-    )
+@dataclasses.dataclass(frozen=True)
+class Job:
+    """A stage on one kind of device, to be estimated on meshes of them.
 
-
-def traffic(
-    config: Config,
-    stage: Stage,
-    mesh: MeshSizes,
-    work: StepWork,
-    compiled: Compiled | None = None,
-) -> dict[tuple[str, str], float]:
-    """Return the bytes that a device sends in a step, by kind and axis of the mesh.
-
-    Once per step, weights are gathered for the forward pass and for the backward pass (``fsdp``),
-    and once more if the backward pass recomputes the forward pass in 16 bits, because XLA then does
-    not merge the two gathers. Gradients are reduce-scattered (``fsdp``) and summed over copies of
-    the weights (``data``, ``context``). In every pass the results of products whose contracted
-    dimension is sharded are summed over ``tensor``. Communication of layers along ``context`` is
-    that of the compiled program, scaled to a device's clips; 0 without such a program.
+    Attributes:
+        config: the experiment.
+        stage: the stage.
+        chip: the kind of device.
+        work: the work of a step.
+        compiled: the program compiled for the requested mesh; without it, temporary memory is
+            unknown.
     """
-    c = counts(config, stage)
-    wide = 2 if config.model.dtype == "bfloat16" else FLOAT
-    parameters = (c["trained"].on(mesh) + c["frozen"].on(mesh)) * mesh.fsdp * wide
-    gradients = c["trained"].on(mesh) * mesh.fsdp * wide
-    gathered = 2 + (work.recomputes and wide < FLOAT)
-    summed = (2 + work.recomputes) * work.needed.summed / (mesh.batch * mesh.context)
-    sent = {
-        ("all-gather", "fsdp"): (gathered * parameters + c["encoders"].count * wide)
-        * _ring(mesh.fsdp),
-        ("reduce-scatter", "fsdp"): gradients * _ring(mesh.fsdp),
-        ("all-reduce", "data"): 2 * gradients / mesh.fsdp * _ring(mesh.data),
-        ("all-reduce", "tensor"): 2 * summed * _ring(mesh.tensor),
-        ("all-reduce", "context"): 2 * gradients / mesh.fsdp * _ring(mesh.context),
-    }
-    if compiled is not None and mesh.context > 1:
-        share = compiled.mesh.batch * compiled.mesh.tensor / (mesh.batch * mesh.tensor)
-        along = in_bfloat16(config, compiled.sent_along("context"))
-        for kind, size in along.items():
-            sent[kind, "context"] = max(sent.get((kind, "context"), 0.0), share * size)
-    return {key: size for key, size in sent.items() if size > 0}
+
+    config: Config
+    stage: Stage
+    chip: Chip
+    work: StepWork
+    compiled: Compiled | None = None
+
+    def predict(self, mesh: MeshSizes) -> Prediction:
+        """Predict the time of a step."""
+        clips, done = self.stage.settings(self.config).batch, self.work.on_device(mesh)
+        peak = self.chip.flops if self.config.model.dtype == "bfloat16" else self.chip.flops / 2
+        products_s = sum(flops / (peak * REACHED[kind]) for kind, flops in done.items())
+        streamed = self.work.traffic_on_device(mesh)
+        streamed += OPTIMIZER * FLOAT * counts(self.config, self.stage)["trained"].on(mesh)
+        streaming_s = streamed / (self.chip.bandwidth * STREAMED)
+        sent = self.traffic(mesh)
+        seconds = {key: size / self._rate(mesh, key[1]) for key, size in sent.items()}
+        blocking = sum(s for (_, axis), s in seconds.items() if axis in SPLIT)
+        overlapping = sum(s for (_, axis), s in seconds.items() if axis not in SPLIT)
+        busy = products_s + streaming_s
+        waiting_s = blocking + max(0.0, overlapping - busy)
+        step_s = busy + waiting_s
+        return Prediction(
+            products_s=products_s,
+            streaming_s=streaming_s,
+            sent=sent,
+            waiting_s=waiting_s,
+            step_s=step_s,
+            needed_flops=self.work.needed.total,
+            executed_flops=sum(done.values()),
+            mfu=self.work.needed.total / (step_s * self.chip.flops * mesh.devices),
+            clips_per_s=clips / step_s,
+        )
+
+    def traffic(self, mesh: MeshSizes) -> dict[tuple[str, str], float]:
+        """Return the bytes that a device sends in a step, by kind and axis of the mesh.
+
+        Once per step, weights are gathered for the forward pass and for the backward pass
+        (``fsdp``), and once more if the backward pass recomputes the forward pass in 16 bits,
+        because XLA then does not merge the two gathers. Gradients are reduce-scattered (``fsdp``)
+        and summed over copies of the weights (``data``, ``context``). In every pass the results of
+        products whose contracted dimension is sharded are summed over ``tensor``. Communication of
+        layers along ``context`` is that of the compiled program, scaled to a device's clips; 0
+        without such a program.
+        """
+        c = counts(self.config, self.stage)
+        wide = 2 if self.config.model.dtype == "bfloat16" else FLOAT
+        parameters = (c["trained"].on(mesh) + c["frozen"].on(mesh)) * mesh.fsdp * wide
+        gradients = c["trained"].on(mesh) * mesh.fsdp * wide
+        gathered = 2 + (self.work.recomputes and wide < FLOAT)
+        summed = (2 + self.work.recomputes) * self.work.needed.summed / (mesh.batch * mesh.context)
+        sent = {
+            ("all-gather", "fsdp"): (gathered * parameters + c["encoders"].count * wide)
+            * _ring(mesh.fsdp),
+            ("reduce-scatter", "fsdp"): gradients * _ring(mesh.fsdp),
+            ("all-reduce", "data"): 2 * gradients / mesh.fsdp * _ring(mesh.data),
+            ("all-reduce", "tensor"): 2 * summed * _ring(mesh.tensor),
+            ("all-reduce", "context"): 2 * gradients / mesh.fsdp * _ring(mesh.context),
+        }
+        if self.compiled is not None and mesh.context > 1:
+            there = self.compiled.mesh
+            share = there.batch * there.tensor / (mesh.batch * mesh.tensor)
+            along = in_bfloat16(self.config, self.compiled.sent_along("context"))
+            for kind, size in along.items():
+                sent[kind, "context"] = max(sent.get((kind, "context"), 0.0), share * size)
+        return {key: size for key, size in sent.items() if size > 0}
+
+    def _rate(self, mesh: MeshSizes, axis: str) -> float:
+        """Return the bytes/s at which a device sends along an axis of the mesh."""
+        return rate(next(group for group, axes in mesh.groups.items() if axes == axis), self.chip)
+
+    def assess(self, mesh: MeshSizes) -> Arrangement:
+        """Compute the memory and the time of a step."""
+        memory = memory_of(self.config, self.stage, mesh, self.compiled)
+        fits = memory.peak <= MARGIN * self.chip.memory
+        return Arrangement(mesh, memory, self.predict(mesh), fits)
+
+    def rank(self, devices: int, context: int = 1) -> list[Arrangement]:
+        """Return all meshes of a number of devices: those that fit, fastest first, then the others.
+
+        If two times agree to two digits, the mesh that needs less memory comes first. Of those that
+        do not fit, the smallest comes first. ``context`` is fixed.
+        """
+        meshes = arrangements(self.config, self.stage, devices, context)
+        return sorted(map(self.assess, meshes), key=_order)
 
 
 def _ring(devices: int) -> float:
     return (devices - 1) / devices
-
-
-def _rate(mesh: MeshSizes, axis: str, chip: Chip) -> float:
-    """Return the bytes/s at which a device sends along an axis of the mesh."""
-    places = np.arange(mesh.devices).reshape(tuple(mesh.sizes.values()))
-    group = np.moveaxis(places, AXES.index(axis), -1).reshape(-1, mesh.sizes[axis])[0]
-    return rate(tuple(group.tolist()), chip)
 
 
 def rate(group: tuple[int, ...], chip: Chip) -> float:
@@ -319,30 +327,6 @@ def rate(group: tuple[int, ...], chip: Chip) -> float:
     if len(islands) <= 1:
         return chip.link
     return min(chip.link, chip.network * math.ceil(len(group) / len(islands)))
-
-
-def assess(
-    config: Config,
-    stage: Stage,
-    mesh: MeshSizes,
-    chip: Chip,
-    work: StepWork,
-    compiled: Compiled | None = None,
-) -> Arrangement:
-    """Compute a stage's memory and time on a mesh of one kind of device.
-
-    Args:
-        config: the experiment.
-        stage: the stage.
-        mesh: the device mesh.
-        chip: the kind of device.
-        work: the work of a step.
-        compiled: the program compiled for the requested mesh; without it, temporary memory is
-            unknown.
-    """
-    memory = memory_of(config, stage, mesh, compiled)
-    time = predict(config, stage, mesh, chip, work, compiled)
-    return Arrangement(mesh, memory, time, memory.peak <= MARGIN * chip.memory)
 
 
 def arrangements(
@@ -360,26 +344,6 @@ def arrangements(
             continue
         for fsdp in _divisors(rest):
             yield MeshSizes(rest // fsdp, fsdp, tensor, context)
-
-
-def rank(
-    config: Config,
-    stage: Stage,
-    mesh: MeshSizes,
-    chip: Chip,
-    work: StepWork,
-    compiled: Compiled | None = None,
-) -> list[Arrangement]:
-    """Return all meshes for this number of devices: those that fit, fastest first, then the others.
-
-    If two times agree to two digits, the mesh that needs less memory comes first. Of those that do
-    not fit, the smallest comes first. ``context`` stays as requested.
-    """
-    choices = [
-        assess(config, stage, other, chip, work, compiled)
-        for other in arrangements(config, stage, mesh.devices, mesh.context)
-    ]
-    return sorted(choices, key=_order)
 
 
 def _order(choice: Arrangement) -> tuple[bool, float, float]:

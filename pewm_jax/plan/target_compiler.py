@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import itertools
 import json
 import math
 import os
@@ -20,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,7 @@ _OOM = re.compile(
 _UNITS = {"": 1.0, "K": 2.0**10, "M": 2.0**20, "G": 2.0**30, "T": 2.0**40}
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class StageReport:
     """What a chip's compiler says about one stage; bytes and FLOPs are of one device and step.
 
@@ -85,36 +85,35 @@ class StageReport:
     devices: int
     mesh: dict[str, int]
     compiler: dict[str, str]
-    options: dict[str, Any]
+    options: dict[str, Any] = dataclasses.field(default_factory=dict)
     argument_bytes: float | None
-    temporary_bytes: float | None
-    output_bytes: float | None
-    alias_bytes: float | None
-    peak_bytes: float | None
+    temporary_bytes: float | None = None
+    output_bytes: float | None = None
+    alias_bytes: float | None = None
+    peak_bytes: float | None = None
     capacity_bytes: float
-    fits: bool
-    refusal: str
+    fits: bool = False
+    refusal: str = ""
     flops_needed: float
     flops_executed: float
-    bytes: float | None
-    kernels: dict[str, dict[str, int]]
-    collectives: list[dict[str, Any]]
-    roofline_s: float | None
-    bound: str
-    mfu: float | None
-    trace_s: float
-    compile_s: float
-    notes: list[str]
+    bytes: float | None = None
+    kernels: dict[str, dict[str, int]] = dataclasses.field(default_factory=dict)
+    collectives: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    roofline_s: float | None = None
+    bound: str = ""
+    mfu: float | None = None
+    trace_s: float = 0.0
+    compile_s: float = 0.0
+    notes: list[str] = dataclasses.field(default_factory=list)
+
+
+def sent_by_axes(sent: Mapping[tuple[str, str], float]) -> list[dict[str, Any]]:
+    """Return bytes by (kind, axes of the mesh) in the form of ``StageReport.collectives``."""
+    return [{"kind": kind, "axis": axes, "bytes": size} for (kind, axes), size in sent.items()]
 
 
 def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> StageReport:
-    """Compile a stage in a process of its own.
-
-    Args:
-        config: the experiment.
-        stage: the name of the stage.
-        chip: the kind of device.
-        devices: number of devices.
+    """Compile the stage of this name in a process of its own.
 
     Raises:
         UserError: the compiler is not installed, or it fails for another reason than memory.
@@ -203,10 +202,10 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
     import jax  # noqa: PLC0415 - only this process uses JAX
 
     from pewm_jax.data import abstract  # noqa: PLC0415
-    from pewm_jax.plan import chip_program, measure, suggest  # noqa: PLC0415
-    from pewm_jax.train import sharding, stages, step  # noqa: PLC0415
+    from pewm_jax.plan import measure, program, suggest  # noqa: PLC0415
+    from pewm_jax.train import runs, sharding, step  # noqa: PLC0415
 
-    (stage,) = (one for one in stages.planned(config) if one.name == stage_name)
+    (stage,) = (one for one in runs.planned(config) if one.name == stage_name)
     devices = topology.devices(chip, count)
     mesh = sharding.make_mesh(devices, config.train.mesh)
     sizes = measure.MeshSizes(**{name: mesh.shape[name] for name in AXES})
@@ -218,41 +217,26 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
     lowered = traced.lower()
     trace_s = time.monotonic() - began
     work = measure.work_of(config, stage, traced, chip)
-    capacity = topology.capacity(chip)
     report = StageReport(
         name=stage.name,
         chip=chip.name,
         devices=count,
         mesh=sizes.sizes,
         compiler=topology.compiler(chip),
-        options={},
         argument_bytes=suggest.memory_of(config, stage, sizes).state,
-        temporary_bytes=None,
-        output_bytes=None,
-        alias_bytes=None,
-        peak_bytes=None,
-        capacity_bytes=capacity,
-        fits=False,
-        refusal="",
+        capacity_bytes=topology.capacity(chip),
         flops_needed=work.needed.total / count,
         flops_executed=sum(work.on_device(sizes).values()),
-        bytes=None,
-        kernels={},
-        collectives=[],
-        roofline_s=None,
-        bound="",
-        mfu=None,
         trace_s=trace_s,
-        compile_s=0.0,
         notes=list(UNKNOWN),
     )
-    options: dict[str, str | bool] = {}
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="pewm-hlo-") as folder:
         # A TPU's compiled program cannot always be printed; what its compiler writes can be read.
         written: dict[str, str | bool] = (
             {"xla_dump_to": folder, "xla_dump_hlo_as_text": True} if chip.platform == "tpu" else {}
         )
+        options: dict[str, str | bool] = {}
         try:
             try:
                 compiled = lowered.compile(compiler_options=written)
@@ -267,7 +251,6 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
         text = _text(compiled, Path(folder))
     memory: Any = compiled.memory_analysis()
     arguments, temporary = measure.device_memory(compiled)
-    notes: list[str] = list(UNKNOWN)
     report = dataclasses.replace(
         report,
         options=dict(options),
@@ -276,25 +259,29 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
         output_bytes=float(memory.output_size_in_bytes),
         alias_bytes=float(memory.alias_size_in_bytes),
         peak_bytes=arguments + temporary,
-        fits=arguments + temporary <= capacity,
+        fits=arguments + temporary <= report.capacity_bytes,
         compile_s=compile_s,
     )
     if not text:
-        notes.append("The compiler does not print this program: its kernels are unknown.")
-        return dataclasses.replace(_timed(report, config, chip, 0.0), notes=notes)
-    program = chip_program.read(text)
-    if program.unknown:
-        notes.append(f"Loops of unknown length count as one run: {', '.join(program.unknown)}.")
+        report.notes.append("The compiler does not print this program: its kernels are unknown.")
+        return _timed(report, config, chip, 0.0)
+    found = program.read(text, for_chip=True)
+    if found.unknown:
+        loops = ", ".join(found.unknown)
+        report.notes.append(f"Loops of unknown length count as one run: {loops}.")
     if options:
-        notes.append("Compiled without Triton's matrix products, which need a device for one.")
+        report.notes.append(
+            "Compiled without Triton's matrix products, which need a device for one."
+        )
     report = dataclasses.replace(
         report,
-        bytes=program.bytes,
-        kernels=program.kernels,
-        collectives=_along_axes(program.collectives, sizes.sizes),
-        notes=notes,
+        bytes=found.bytes,
+        kernels=found.kernels,
+        collectives=sent_by_axes(sizes.sent(found.collectives)),
     )
-    return _timed(report, config, chip, _link_seconds(program.collectives, chip))
+    sent = (item for item in found.collectives if len(item.group) > 1)
+    link_s = math.fsum(item.sent / suggest.rate(item.group, chip) for item in sent)
+    return _timed(report, config, chip, link_s)
 
 
 def _text(compiled: Any, folder: Path) -> str:
@@ -361,62 +348,6 @@ def _timed(report: StageReport, config: Config, chip: Chip, link_s: float) -> St
         bound=bound,
         mfu=report.flops_needed / (seconds[bound] * chip.flops),
     )
-
-
-def _link_seconds(collectives: Any, chip: Chip) -> float:
-    """Return the seconds in which a device sends everything, one collective after the other."""
-    from pewm_jax.plan import suggest  # noqa: PLC0415 - only this process uses JAX
-
-    return math.fsum(
-        item.sent / suggest.rate(item.group, chip) for item in collectives if len(item.group) > 1
-    )
-
-
-def _along_axes(collectives: Any, sizes: dict[str, int]) -> list[dict[str, Any]]:
-    """Sum the communication of each kind along each axis of the mesh, or along several."""
-    groups = _groups(sizes)
-    sent: dict[tuple[str, str], float] = {}
-    for item in collectives:
-        axis = _axis(item.group, groups)
-        key = item.kind, axis
-        sent[key] = sent.get(key, 0.0) + item.sent
-    return [
-        {"kind": kind, "axis": axis, "bytes": size}
-        for (kind, axis), size in sorted(sent.items())
-        if size
-    ]
-
-
-def _axis(group: tuple[int, ...], groups: dict[tuple[int, ...], str]) -> str:
-    """Return the axes along which devices communicate: all along them, or some of these."""
-    around = [axes for whole, axes in groups.items() if set(group) <= set(whole)]
-    exact = groups.get(tuple(sorted(group)))
-    if exact or len(group) != 2 or not around:  # a permutation names pairs
-        return exact or "other"
-    return min(around, key=lambda axes: axes.count("+"))
-
-
-def _groups(sizes: dict[str, int]) -> dict[tuple[int, ...], str]:
-    """Return the mesh axes along which each group of devices lies, joined by ``+``."""
-    split = [name for name, size in sizes.items() if size > 1]
-    strides = {
-        name: math.prod(list(sizes.values())[place + 1 :]) for place, name in enumerate(sizes)
-    }
-    found: dict[tuple[int, ...], str] = {}
-    for count in range(1, len(split) + 1):
-        for axes in itertools.combinations(split, count):
-            others = [name for name in split if name not in axes]
-            along, across = (
-                [
-                    sum(place * strides[name] for place, name in zip(places, names, strict=True))
-                    for places in itertools.product(*(range(sizes[name]) for name in names))
-                ]
-                for names in (axes, others)
-            )
-            for start in across:
-                group = tuple(sorted(start + step for step in along))
-                found.setdefault(group, "+".join(axes))
-    return found
 
 
 if __name__ == "__main__":

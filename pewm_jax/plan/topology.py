@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import importlib.metadata
 import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,6 +57,18 @@ class GPU:
     description: str
 
 
+_H100 = GPU(
+    core_count=132,
+    fpus_per_core=128,
+    shared_memory_per_core=233472,
+    shared_memory_per_block_optin=232448,
+    memory_bandwidth=3352320000000,
+    l2_cache_size=52428800,
+    clock_rate_ghz=1.98,
+    device_memory_size=84942979072,
+    capability=9,
+    description="NVIDIA H100 80GB HBM3",
+)
 GPUS = {
     "a100": GPU(
         core_count=108,
@@ -69,35 +82,16 @@ GPUS = {
         capability=8,
         description="NVIDIA A100-SXM4-80GB",
     ),
-    "h100": GPU(
-        core_count=132,
-        fpus_per_core=128,
-        shared_memory_per_core=233472,
-        shared_memory_per_block_optin=232448,
-        memory_bandwidth=3352320000000,
-        l2_cache_size=52428800,
-        clock_rate_ghz=1.98,
-        device_memory_size=84942979072,
-        capability=9,
-        description="NVIDIA H100 80GB HBM3",
-    ),
-    "h200": GPU(
-        core_count=132,
-        fpus_per_core=128,
-        shared_memory_per_core=233472,
-        shared_memory_per_block_optin=232448,
+    "h100": _H100,
+    "h200": dataclasses.replace(
+        _H100,
         memory_bandwidth=4800000000000,
-        l2_cache_size=52428800,
-        clock_rate_ghz=1.98,
         device_memory_size=151397597184,
-        capability=9,
         description="NVIDIA H200",
     ),
-    "b200": GPU(
+    "b200": dataclasses.replace(
+        _H100,
         core_count=148,
-        fpus_per_core=128,
-        shared_memory_per_core=233472,
-        shared_memory_per_block_optin=232448,
         memory_bandwidth=7672320000000,
         l2_cache_size=132644864,
         clock_rate_ghz=1.965,
@@ -121,11 +115,7 @@ GPUS_OF_A_HOST = 8
 
 
 def require_compiler(chip: Chip) -> None:
-    """Check that the compiler of a chip is installed.
-
-    Raises:
-        UserError: it is not; the message names the extra that installs it.
-    """
+    """Check that a chip's compiler is installed; the error names the extra that installs it."""
     versions = _versions(chip)
     missing = [name for name in PACKAGES[chip.platform] if name not in versions]
     if missing:
@@ -192,10 +182,10 @@ def devices(chip: Chip, count: int) -> Sequence[Any]:
 
 
 def tpu_topology(chip: Chip, count: int) -> str:
-    """Return the name of the topology that is closest to a square or cube: ``v5p:2x2x2``.
+    """Return the name of the topology of this many devices closest to a square or cube.
 
     Raises:
-        UserError: there is none of this many devices.
+        UserError: there is none.
     """
     chips, odd = divmod(count, 2) if chip.name == "tpu7x" else (count, 0)
     axes = 2 if chip.name in ("v5e", "v6e") else 3
@@ -203,7 +193,7 @@ def tpu_topology(chip: Chip, count: int) -> str:
     shapes = [
         shape
         for shape in itertools.combinations_with_replacement(divisors, axes)
-        if _product(shape) == chips and (chips < 4 or sum(side % 2 == 0 for side in shape) >= 2)
+        if math.prod(shape) == chips and (chips < 4 or sum(side % 2 == 0 for side in shape) >= 2)
     ]
     if odd or not shapes:
         raise UserError(
@@ -213,13 +203,6 @@ def tpu_topology(chip: Chip, count: int) -> str:
     if axes == 3:
         shape = sorted(shape, reverse=chips <= 4)  # a host is 2 × 2 × 1
     return f"{chip.name}:{'x'.join(map(str, shape))}"
-
-
-def _product(numbers: Sequence[int]) -> int:
-    result = 1
-    for number in numbers:
-        result *= number
-    return result
 
 
 def target_config(gpu: GPU) -> str:

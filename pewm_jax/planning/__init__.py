@@ -43,7 +43,7 @@ def register() -> None:
         UserError: Gymnasium is not installed.
     """
     # Imported lazily: planners, scores and the functional environment do not need Gymnasium.
-    from pewm_jax.planning.extra import gymnasium  # noqa: PLC0415
+    from pewm_jax.planning.observations import gymnasium  # noqa: PLC0415
 
     if HOUSE_ID not in gymnasium.registry:
         gymnasium.register(HOUSE_ID, entry_point="pewm_jax.planning.house:HouseEnv")

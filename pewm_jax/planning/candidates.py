@@ -107,8 +107,7 @@ class ImaginedRollout:
     def __call__(self, actions_KN: Any) -> Frames:
         """Return the frames of K candidates, (K, N) or (K, 1).
 
-        Args:
-            actions_KN: (K, N) discrete or (K, N, 3) continuous actions; see ``worlds.imagine``.
+        They are (K, N) discrete or (K, N, 3) continuous actions; see ``worlds.imagine``.
 
         Raises:
             UserError: they have another shape, are unknown, or are not finite.
@@ -221,18 +220,10 @@ def rank(
     batch: int = 6,
     last: bool = True,
 ) -> Ranking:
-    """Imagine proposals and sort them by cost.
+    """Imagine the (K, N) or (K, N, 3) proposals of any policy and sort them by cost.
 
-    Args:
-        config: the model's settings, or an experiment's.
-        params: its parameters.
-        state: the world's state.
-        proposals_KN: (K, N) discrete or (K, N, 3) continuous actions of any policy.
-        cost: see ``planning.costs``.
-        goal: the goal, T = 1.
-        key: PRNG key of the noise, the same for all.
-        batch: see ``ImaginedRollout``.
-        last: imagine only the last frame of each; False for costs of all frames.
+    The other arguments are those of ``ImaginedRollout``, a cost of ``planning.costs`` and the goal,
+    T = 1. With ``last=False`` all frames are imagined, for costs of all.
 
     Raises:
         UserError: a cost is not a finite number; see ``plan.checked``.

@@ -40,10 +40,9 @@ AT_ONCE = 2**18
 
 @dataclasses.dataclass(frozen=True)
 class PictureCost:
-    """A cost of single images, computed for the last frame or for all with weights.
+    """A cost of single images, computed for the last frame or for all.
 
-    Attributes:
-        weights: weight of each of the N frames in the mean, or None for the last frame only.
+    ``weights`` are those of each of the N frames in the mean, or None for the last frame only.
     """
 
     weights: tuple[float, ...] | None = dataclasses.field(default=None, kw_only=True)
@@ -58,11 +57,7 @@ class PictureCost:
         )
 
     def __call__(self, frames: Frames, goal: Frames) -> Array:
-        """Return (K,) costs.
-
-        Raises:
-            UserError: frames and goal differ in size, or the numbers of weights and frames differ.
-        """
+        """Return (K,) costs; frames and goal have one size, and each frame has a weight."""
         frames, goal = as_signal(frames), as_signal(goal)
         count = _require_alike(frames, goal)
         if self.weights is not None and len(self.weights) != count:
@@ -117,12 +112,7 @@ class Depth(PictureCost):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Perceptual(PictureCost):
-    """LPIPS distance to the goal; ``perceptual`` loads its weights.
-
-    Attributes:
-        net: the network.
-        params: its parameters.
-    """
+    """LPIPS distance to the goal; ``perceptual`` loads its weights."""
 
     net: Net
     params: Params = dataclasses.field(repr=False)
@@ -136,12 +126,9 @@ class Perceptual(PictureCost):
 def perceptual(
     path: str | Path | None = None, net: Net = "alex", weights: tuple[float, ...] | None = None
 ) -> Perceptual:
-    """Return LPIPS as a cost, with weights from a file or the installed package.
+    """Return LPIPS as a cost, with weights from a file (``models.lpips.convert``) or the package's.
 
-    Args:
-        path: a file of weights (``models.lpips.convert``), or None for the package's.
-        net: the network.
-        weights: see ``PictureCost``.
+    ``weights``: see ``PictureCost``.
 
     Raises:
         UserError: there are no weights, or they are damaged or of another network.
@@ -168,9 +155,8 @@ def _batch_size(rgb_PHWC: Array) -> int:
 class Features(PictureCost):
     """Mean squared difference of an image encoder's features.
 
-    Attributes:
-        settings: an encoder (``models.encoders``), or a model, whose memory's encoder is used.
-        params: the encoder's parameters, or the world model's.
+    ``settings`` is an encoder (``models.encoders``), with its parameters; or a model, whose
+    memory's encoder is used, with the model's.
     """
 
     settings: Encoder | AssembledModel
@@ -203,10 +189,9 @@ def _features(
 class Distance:
     """The true distance of the last pose from the goal: an oracle, to evaluate planners alone.
 
-    Attributes:
-        function: maps poses (K, 4, 4) and the goal's pose (4, 4), ``world_from_camera``, to (K,)
-            distances (inf if unreachable), such as metres along the shortest path, in NumPy or
-            JAX; for example ``straight``.
+    ``function`` maps poses (K, 4, 4) and the goal's pose (4, 4), ``world_from_camera``, to (K,)
+    distances (inf if unreachable), such as metres along the shortest path, in NumPy or JAX; for
+    example ``straight``.
     """
 
     function: Callable[[Any, Any], Any]
@@ -220,10 +205,7 @@ class Distance:
 def straight(poses_K44: Any, goal_44: Any, metres_per_radian: float = 0.25) -> Array:
     """Return the Euclidean distance plus the weighted difference of yaw, metres.
 
-    Args:
-        poses_K44: (K, 4, 4) poses.
-        goal_44: (4, 4) pose of the goal.
-        metres_per_radian: weight of a radian of yaw.
+    ``poses_K44`` are (K, 4, 4) poses, ``goal_44`` the goal's.
     """
     poses, goal = jnp.asarray(poses_K44), jnp.asarray(goal_44)
     apart = jnp.linalg.norm(poses[:, :3, 3] - goal[:3, 3], axis=-1)
@@ -233,11 +215,7 @@ def straight(poses_K44: Any, goal_44: Any, metres_per_radian: float = 0.25) -> A
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sum:
-    """A weighted sum of costs.
-
-    Attributes:
-        parts: ``(weight, cost)`` pairs.
-    """
+    """A weighted sum of costs, from ``(weight, cost)`` pairs."""
 
     parts: tuple[tuple[float, FrameCost], ...]
 
@@ -247,11 +225,6 @@ class Sum:
 
 
 def with_depth(cost: FrameCost, weight: float) -> Sum:
-    """Return a cost that also compares depth.
-
-    Args:
-        cost: the cost of colours.
-        weight: weight of the mean log-depth difference (``Depth``).
-    """
+    """Return a cost that adds the weighted log-depth difference (``Depth``) to another cost."""
     weights = getattr(cost, "weights", None)
     return Sum(((1.0, cost), (weight, Depth(weights=weights))))

@@ -27,7 +27,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -36,8 +36,8 @@ from pewm_jax.data.make_episode import SPLITS
 from pewm_jax.data.navigation import NavGrid, PathsToGoal, sample_free
 from pewm_jax.data.simulator import Simulator, move, open_simulator
 from pewm_jax.planning import observations, scores
-from pewm_jax.planning.extra import gymnasium
 from pewm_jax.planning.house_config import HouseConfig, settings
+from pewm_jax.planning.observations import GoalEnv
 from pewm_jax.types import Frames
 
 GOALS_TRIED = 20
@@ -68,14 +68,8 @@ def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, wher
     The goal is uniform over the free area, the start is uniform over the part of it within bounds,
     and the start's heading is uniform.
 
-    Args:
-        config: ``min_distance_m`` and ``max_distance_m`` are used.
-        grid: where the agent can stand.
-        rng: random numbers.
-        where: name of the scene, for error messages.
-
     Raises:
-        UserError: no such pair exists.
+        UserError: no such pair exists; the message names the scene, ``where``.
     """
     low, high = config.min_distance_m, config.max_distance_m
     farthest = 0.0
@@ -102,56 +96,35 @@ def draw_task(config: HouseConfig, grid: NavGrid, rng: np.random.Generator, wher
     )
 
 
-class HouseEnv(gymnasium.Env):
+class HouseEnv(GoalEnv):
     """A house environment, created by ``gymnasium.make("pewm_jax/House-v0", **settings)``.
 
     The same seed gives bit-identical episodes. Spaces: see ``planning.observations``.
-
-    Attributes:
-        config: the settings.
-        intrinsics_4: (4,) fx, fy, cx, cy of the camera, pixels, centres at +0.5.
     """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
 
     def __init__(
         self, config: HouseConfig | None = None, render_mode: str | None = None, **overrides: Any
     ):
-        """Open the house.
-
-        Args:
-            config: the settings; or pass them as keyword arguments.
-            render_mode: None or "rgb_array".
-            overrides: settings of ``HouseConfig``.
+        """Open the house with these settings, which may be passed as keyword arguments instead.
 
         Raises:
             UserError: invalid settings, a mesh that does not load or has no free floor, or no
                 renderer.
         """
-        if render_mode not in (None, "rgb_array"):
-            raise UserError(f"House has no render_mode {render_mode!r}; use 'rgb_array'.")
         if config is not None and overrides:
             raise UserError("House got a HouseConfig and other settings; pass only one of the two.")
-        self.config = settings(overrides) if config is None else config
-        self.render_mode = render_mode
-        self.observation_space = observations.observation_space(self.config)
-        self.action_space = observations.action_space(self.config)
+        super().__init__(settings(overrides) if config is None else config, render_mode, "House")
         self._simulator = self._open(self.config.house)
         self.intrinsics_4 = self._simulator.intrinsics_4.copy()
         self._task: Task | None = None
-        self._over = True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode.
-
-        Args:
-            seed: seed of all randomness from here on.
-            options: must be empty.
+        """Start an episode; there are no options.
 
         Raises:
-            UserError: the scene is too small for the task.
+            UserError: the scene is too small for the task, or there are options.
         """
         super().reset(seed=seed)
         if options:
@@ -164,7 +137,8 @@ class HouseEnv(gymnasium.Env):
         self._task = draw_task(config, simulator.grid, self.np_random, simulator.scene.name)
         self._planar = self._task.start_3
         self._goal = simulator.frames(self._task.goal_3[None])
-        self._steps, self._walked, self._collided, self._over = 0, 0.0, False, False
+        self._collided = False
+        self._begin_episode()
         self._left = self._task.shortest_m
         self._look()
         return self._observation(), self._info()
@@ -175,9 +149,7 @@ class HouseEnv(gymnasium.Env):
         Raises:
             UserError: the action is not in the space, or there is no episode.
         """
-        task = self._task
-        if task is None or self._over:
-            raise UserError("step() was called outside of an episode: call reset() first.")
+        self._require_episode()
         moved = observations.require_action(self.config, action)
         before = self._planar
         self._planar, self._collided = move(
@@ -185,34 +157,14 @@ class HouseEnv(gymnasium.Env):
         )
         self._steps += 1
         self._walked += float(np.linalg.norm(self._planar[:2] - before[:2]))
-        nearer, self._left = self._left, task.ways.length(self._planar[:2])
-        nearer -= self._left
+        before_m, self._left = self._left, self.task.ways.length(self._planar[:2])
         self._look()
-        info = self._info()
-        success = info["success"]
-        truncated = not success and self._steps >= self.config.max_steps
-        self._over = success or truncated
-        reward = nearer + (self.config.success_reward if success else 0.0)
-        return self._observation(), reward, success, truncated, info
-
-    def render(self) -> np.ndarray | None:
-        """Return the current image, (H, W, 3) uint8, with render mode "rgb_array".
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
-        if self.render_mode is None:
-            return None
-        _ = self.task
-        return self._seen.rgb_THWC[0].copy()
+        return self._outcome(before_m - self._left)
 
     def look_around(self) -> Frames:
         """Return the frames of one full turn in place; the state does not change.
 
         The last frame is the present one, so a world can be started from these frames.
-
-        Raises:
-            UserError: before the first ``reset``.
         """
         turns = max(1, round(360 / self.config.turn_deg))
         planar = np.tile(self.planar, (turns, 1))
@@ -220,11 +172,7 @@ class HouseEnv(gymnasium.Env):
         return self._simulator.frames(planar)
 
     def goal_frame(self) -> Frames:
-        """Return the frame at the goal.
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
+        """Return the frame at the goal; there is none before the first ``reset``."""
         _ = self.task
         return self._goal
 
@@ -235,22 +183,14 @@ class HouseEnv(gymnasium.Env):
 
     @property
     def task(self) -> Task:
-        """Return the episode's task.
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
+        """Return the episode's task, or raise UserError before the first ``reset``."""
         if self._task is None:
             raise UserError("the house has no episode yet: call reset() first.")
         return self._task
 
     @property
     def planar(self) -> np.ndarray:
-        """Return a copy of the agent's pose: x, y, yaw in (−π, π], float64.
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
+        """Return a copy of the agent's pose: x, y, yaw in (−π, π], float64."""
         _ = self.task
         return self._planar.copy()
 
@@ -267,18 +207,14 @@ class HouseEnv(gymnasium.Env):
         )
 
     def _look(self) -> None:
-        self._seen = self._simulator.frames(self._planar[None])
+        seen = self._simulator.frames(self._planar[None])
+        pose = seen.camera.world_from_camera
+        self._seen = {"rgb": seen.rgb_THWC[0], "depth": seen.depth_THW[0], "pose": pose[0]}
 
-    def _observation(self) -> dict[str, np.ndarray]:
-        goal = observations.goal_in_frame(self._planar, self.task.goal_3[:2])
+    def _goal_seen(self) -> np.ndarray:
         if self.config.task == "image":
-            goal = self._goal.rgb_THWC[0].copy()
-        return {
-            "rgb": self._seen.rgb_THWC[0].copy(),
-            "depth": self._seen.depth_THW[0].copy(),
-            "pose": self._seen.camera.world_from_camera[0].copy(),
-            "goal": goal,
-        }
+            return self._goal.rgb_THWC[0].copy()
+        return observations.goal_in_frame(self._planar, self.task.goal_3[:2])
 
     def _info(self) -> dict[str, Any]:
         task, config = self.task, self.config

@@ -61,14 +61,10 @@ def reset(
     *,
     depth_scale: float | None = None,
 ) -> ImaginedState:
-    """Start from observed frames.
+    """Start from S ≥ 1 posed RGB-D frames; the last one is the present.
 
-    Args:
-        model: the model's settings, or an experiment's; static under jit.
-        params: the world model's parameters.
-        frames: S ≥ 1 posed RGB-D frames; the last one is the present.
-        key: for worlds with a random start; the library has none.
-        depth_scale: as for ``worlds.start``.
+    ``model`` is static under jit. ``key`` is for worlds with a random start; the library has none.
+    ``depth_scale``: as for ``worlds.start``.
 
     Raises:
         UserError: the frames do not fit the model, or are invalid; see ``worlds.start``.
@@ -140,10 +136,8 @@ def reached(pose: Array, goal: Array, within_m: float = 0.5, within_deg: float =
 def satisfied(seen: dict[str, Array], cost: Callable[[Array], Array], at_most: float) -> Array:
     """Return whether a cost of the observed image is at most a bound: a goal without a pose.
 
-    Args:
-        seen: the observation of a single step.
-        cost: an image (H, W, 3) uint8 → a number, such as the distance to a goal image.
-        at_most: the bound, included.
+    ``seen`` is the observation of a single step; ``cost`` maps an image (H, W, 3) uint8 to a
+    number, such as the distance to a goal image.
     """
     return jnp.asarray(cost(seen["rgb"]) <= at_most)
 

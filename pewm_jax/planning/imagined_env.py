@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import jax
 import numpy as np
@@ -27,21 +27,17 @@ from pewm_jax.codecs.signals import rgb_from_signal
 from pewm_jax.config import Config, UserError, World
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
 from pewm_jax.planning import imagined, observations, scores
-from pewm_jax.planning.extra import gymnasium
 from pewm_jax.planning.house import HouseEnv
 from pewm_jax.planning.house_config import HouseConfig
+from pewm_jax.planning.observations import GoalEnv
 from pewm_jax.types import Frames, Params
 
 
-class WorldModelEnv(gymnasium.Env):
+class WorldModelEnv(GoalEnv):
     """An imagined world as an environment; spaces and settings are the house's.
 
-    Attributes:
-        config: the settings, with the image size and the actions of the model.
-        intrinsics_4: (4,) intrinsics of the camera of the first frames.
+    Image size and actions are those of the model; the camera is that of the first frames.
     """
-
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
 
     def __init__(
         self,
@@ -68,8 +64,6 @@ class WorldModelEnv(gymnasium.Env):
         Raises:
             UserError: the render mode is unknown, or the world has no actions.
         """
-        if render_mode not in (None, "rgb_array"):
-            raise UserError(f"the world has no render_mode {render_mode!r}; use 'rgb_array'.")
         self._model, self._params = model, params
         world = worlds.model_of(model)
         if not (isinstance(world, World) and world.capabilities.actions):
@@ -78,33 +72,24 @@ class WorldModelEnv(gymnasium.Env):
                 "world with actions, such as pewm_jax.load('small')."
             )
         clip, actions = world.clip, world.actions
-        self.config = dataclasses.replace(
-            house or HouseConfig(),
-            height=clip.height,
-            width=clip.width,
-            step_m=actions.step_m,
-            turn_deg=actions.turn_deg,
-        )
-        self.render_mode = render_mode
-        self.observation_space = observations.observation_space(self.config)
-        self.action_space = observations.action_space(self.config)
+        of_model = {"height": clip.height, "width": clip.width}
+        of_model |= {"step_m": actions.step_m, "turn_deg": actions.turn_deg}
+        config = dataclasses.replace(house or HouseConfig(), **of_model)
+        super().__init__(config, render_mode, "the world")
         self._cost, self._cost_at_most = cost, cost_at_most
         self._house: HouseEnv | None = None
         self._house_seed: int | None = None
         self._state: imagined.ImaginedState | None = None
-        self._over = True
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start an episode from real frames.
 
-        Args:
-            seed: seed of all randomness from here on, including the sampling noise; it also
-                determines the house's episode.
-            options: ``frames``: S ≥ 1 posed frames (an episode's, or ``frames_of`` of a house's
-                observations), and ``goal``: the frame at the goal. Without options an episode of
-                the house starts, in which the agent first makes a full turn.
+        ``options`` are ``frames``, S ≥ 1 posed frames (an episode's, or ``frames_of`` of a house's
+        observations), and ``goal``, the frame at the goal. Without options an episode of the house
+        starts, in which the agent first makes a full turn. The seed determines the house's episode
+        and the sampling noise.
 
         Raises:
             UserError: the frames do not fit the model or are invalid, or there is no goal.
@@ -115,7 +100,7 @@ class WorldModelEnv(gymnasium.Env):
         self.intrinsics_4 = np.asarray(frames.camera.intrinsics_4[-1], np.float32)
         self._key = jax.random.key(int(self.np_random.integers(2**31)))
         state = imagined.reset(self._model, self._params, frames, self._key)
-        self._steps, self._walked, self._over = 0, 0.0, False
+        self._begin_episode()
         self._look(imagined.observation(state))
         self._state = state
         self._left = self._measure()
@@ -127,8 +112,8 @@ class WorldModelEnv(gymnasium.Env):
         Raises:
             UserError: the action is not in the space, or there is no episode.
         """
-        if self._state is None or self._over:
-            raise UserError("step() was called outside of an episode: call reset() first.")
+        self._require_episode()
+        assert self._state is not None
         move = observations.require_action(self.config, action).astype(np.float32)
         key = jax.random.fold_in(self._key, self._steps)
         self._state, seen = imagined.step(self._model, self._params, self._state, move, key)
@@ -136,25 +121,8 @@ class WorldModelEnv(gymnasium.Env):
         self._look(seen)
         self._steps += 1
         self._walked += scores.position_error(before, self._seen["pose"])
-        nearer, self._left = self._left, self._measure()
-        info = self._info()
-        success = info["success"]
-        truncated = not success and self._steps >= self.config.max_steps
-        self._over = success or truncated
-        reward = nearer - self._left + (self.config.success_reward if success else 0.0)
-        return self._observation(), reward, success, truncated, info
-
-    def render(self) -> np.ndarray | None:
-        """Return the current image, (H, W, 3) uint8, with render mode "rgb_array".
-
-        Raises:
-            UserError: before the first ``reset``.
-        """
-        if self.render_mode is None:
-            return None
-        if self._state is None:
-            raise UserError("render() was called before the first reset().")
-        return self._seen["rgb"].copy()
+        left, self._left = self._left, self._measure()
+        return self._outcome(left - self._left)
 
     def _begin(self, options: dict[str, Any]) -> tuple[Frames, Frames]:
         """Return the first frames, and the frame at the goal."""
@@ -189,14 +157,13 @@ class WorldModelEnv(gymnasium.Env):
             return float(self._cost(self._seen["rgb"]))
         return scores.position_error(self._seen["pose"], self._goal_pose)
 
-    def _observation(self) -> dict[str, np.ndarray]:
-        planar = observations.planar_of(self._seen["pose"])
-        goal = observations.goal_in_frame(planar, self._goal_pose[:2, 3])
+    def _goal_seen(self) -> np.ndarray:
         if self.config.task == "image":
             image = self._goal.rgb_THWC[-1]
             whole = np.issubdtype(image.dtype, np.integer)
-            goal = np.array(image if whole else rgb_from_signal(image))
-        return {**{name: value.copy() for name, value in self._seen.items()}, "goal": goal}
+            return np.array(image if whole else rgb_from_signal(image))
+        planar = observations.planar_of(self._seen["pose"])
+        return observations.goal_in_frame(planar, self._goal_pose[:2, 3])
 
     def _info(self) -> dict[str, Any]:
         pose, goal = self._seen["pose"], self._goal_pose

@@ -75,12 +75,7 @@ def world_predictor(
 ) -> Predictor:
     """Return a predictor that imagines with a world model and observes the real frames.
 
-    Args:
-        config: the model's settings, or an experiment's.
-        params: its parameters.
-        batch: see ``ImaginedRollout``.
-        last: imagine only the last frame of each candidate; False for costs of all frames.
-        memory: if False, the world's memory is not used.
+    ``batch``, ``last`` and ``memory``: see ``ImaginedRollout``.
     """
     model = worlds.model_of(config)
 
@@ -97,8 +92,7 @@ def world_predictor(
 def simulator_predictor(rollout_from: Callable[[Frames], Rollout]) -> Predictor:
     """Return a predictor that renders the frames of candidates with a simulator.
 
-    Args:
-        rollout_from: maps the present frame, T = 1, to a rollout.
+    ``rollout_from`` maps the present frame, T = 1, to a rollout.
     """
 
     def last(frames: Frames) -> Frames:

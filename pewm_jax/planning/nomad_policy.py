@@ -40,6 +40,7 @@ def history(config: NomadConfig, rgb_SHWC: np.ndarray) -> np.ndarray:
     return np.concatenate([np.repeat(seen[:1], count - len(seen), 0), seen])
 
 
+@functools.partial(jax.jit, static_argnames=("config", "count"), inline=True)
 def propose(
     config: NomadConfig,
     params: Params,
@@ -48,7 +49,7 @@ def propose(
     key: Array,
     count: int,
 ) -> Array:
-    """Sample trajectories.
+    """Sample trajectories: (K, N, 2) waypoints, metres forward and left of the present position.
 
     Pure, and compiled once per configuration, count and set of shapes; inside the caller's jit,
     config and count are static.
@@ -62,24 +63,9 @@ def propose(
         key: randomness.
         count: K proposals.
 
-    Returns:
-        (K, N, 2) waypoints: metres forward and metres left of the present position.
-
     Raises:
         UserError: the number of images is wrong.
     """
-    return _propose(config, params, rgb_THWC, goal_HWC, key, count)
-
-
-@functools.partial(jax.jit, static_argnums=(0, 5), inline=True)
-def _propose(
-    config: NomadConfig,
-    params: Params,
-    rgb_THWC: Array,
-    goal_HWC: Array | None,
-    key: Array,
-    count: int,
-) -> Array:
     seen = nomad.preprocess(config, signal_from_rgb(rgb_THWC))[None]
     shown = (
         seen[:, -1]
@@ -105,17 +91,11 @@ def distance(config: NomadConfig, params: Params, rgb_THWC: Array, goal_HWC: Arr
 
 
 def continuous(waypoints_KN2: np.ndarray) -> np.ndarray:
-    """Return the actions that pass through waypoints, one per waypoint.
+    """Return the (..., N, 3) float32 actions dx, dy, dyaw that pass through (..., N, 2) waypoints.
 
-    The agent moves straight to a waypoint and then turns towards the next one; after the last
-    one, or between equal waypoints, it keeps its heading. So the first move may be sideways, and
-    each is as long as the distance to its waypoint.
-
-    Args:
-        waypoints_KN2: (..., N, 2) metres forward and left of the present position.
-
-    Returns:
-        (..., N, 3) float32: dx, dy, dyaw.
+    The agent moves straight to a waypoint and then turns towards the next one; after the last one,
+    or between equal waypoints, it keeps its heading. So the first move may be sideways, and each is
+    as long as the distance to its waypoint.
     """
     points = np.asarray(waypoints_KN2, np.float64)
     moves = np.diff(points, axis=-2, prepend=np.zeros_like(points[..., :1, :]))
@@ -134,18 +114,11 @@ def continuous(waypoints_KN2: np.ndarray) -> np.ndarray:
 
 
 def discrete(actions: ActionConfig, waypoints_KN2: np.ndarray) -> np.ndarray:
-    """Return the discrete actions that best approximate waypoints, one per waypoint.
+    """Return the discrete actions (..., N) that best approximate (..., N, 2) waypoints, in metres.
 
     They minimize the sum of squared distances between the position after action k and waypoint k:
-    over all sequences for up to 8 waypoints, otherwise by a beam search with
-    ``SEQUENCES_AT_ONCE`` prefixes. Ties prefer forward first, then left.
-
-    Args:
-        actions: the motion of an action.
-        waypoints_KN2: (..., N, 2) metres forward and left of the present position.
-
-    Returns:
-        (..., N) integers.
+    over all sequences for up to 8 waypoints, otherwise by a beam search with ``SEQUENCES_AT_ONCE``
+    prefixes. Ties prefer forward first, then left.
     """
     points = np.asarray(waypoints_KN2, np.float64)
     flat = points.reshape(-1, *points.shape[-2:])
@@ -181,14 +154,9 @@ compiled = propose
 class Policy:
     """A policy for environments: it maps an observation to an action, from one proposal at a time.
 
-    It stores the images of an episode: call ``reset`` at the start of another.
-
-    Args:
-        config: the policy.
-        params: its parameters.
-        actions: the motion of a discrete action; None for continuous actions.
-        steps: number of actions taken from a proposal before the next proposal.
-        seed: seed of the proposals.
+    It stores the images of an episode: call ``reset`` at the start of another. ``actions`` is the
+    motion of a discrete action, None for continuous actions; ``steps`` the number of actions taken
+    from a proposal before the next one.
     """
 
     def __init__(
@@ -216,11 +184,9 @@ class Policy:
         self.waiting = []
 
     def __call__(self, observation: Mapping[str, Any]) -> Any:
-        """Return an action: an integer, or (dx, dy, dyaw).
+        """Return an action, an integer or (dx, dy, dyaw), for an observation with ``rgb``.
 
-        Args:
-            observation: ``rgb``, and ``goal`` if it is an image; without a goal image the policy
-                explores.
+        The goal is ``goal`` if that is an image; otherwise the policy explores.
         """
         self.seen.append(np.asarray(observation["rgb"]))
         if not self.waiting:

@@ -1,4 +1,4 @@
-"""Observation and action spaces, and conversion of observations to the frames that worlds take.
+"""What environments with a goal share: spaces, episodes, and observations as frames for worlds.
 
 An observation is a dictionary:
 
@@ -13,20 +13,93 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
 from pewm_jax.geometry.actions import NAMES, discrete_table
-from pewm_jax.planning.extra import gymnasium
 from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.types import Camera, Frames
+
+try:
+    import gymnasium
+except ImportError:
+    raise UserError(
+        "environments need Gymnasium, which is not installed: pip install 'pewm-jax[planning]'."
+    ) from None
 
 FARTHEST_M = 1e4
 """Bound of positions in the spaces, which must be bounded, metres."""
 _ROUNDING = 1e-6
+
+
+class GoalEnv(gymnasium.Env):
+    """An environment in which an agent with an RGB-D camera has to reach a goal.
+
+    Attributes:
+        config: the settings.
+        intrinsics_4: (4,) fx, fy, cx, cy of the camera, pixels, centres at +0.5.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 8}
+    intrinsics_4: np.ndarray
+    _seen: Mapping[str, np.ndarray]
+    """The present observation, without the goal."""
+
+    def __init__(self, config: HouseConfig, render_mode: str | None, who: str):
+        if render_mode not in (None, "rgb_array"):
+            raise UserError(f"{who} has no render_mode {render_mode!r}; use 'rgb_array'.")
+        self.config, self.render_mode = config, render_mode
+        self.observation_space = observation_space(config)
+        self.action_space = action_space(config)
+        self._begun, self._over = False, True
+
+    def render(self) -> np.ndarray | None:
+        """Return the current image, (H, W, 3) uint8, with render mode "rgb_array".
+
+        Raises:
+            UserError: before the first ``reset``.
+        """
+        if self.render_mode is None:
+            return None
+        if not self._begun:
+            raise UserError("render() was called before the first reset(): call reset() first.")
+        return self._seen["rgb"].copy()
+
+    def _begin_episode(self) -> None:
+        self._steps, self._walked, self._begun, self._over = 0, 0.0, True, False
+
+    def _require_episode(self) -> None:
+        if self._over:
+            raise UserError("step() was called outside of an episode: call reset() first.")
+
+    def _observation(self) -> dict[str, np.ndarray]:
+        """Return the present observation."""
+        return {
+            **{name: value.copy() for name, value in self._seen.items()},
+            "goal": self._goal_seen(),
+        }
+
+    def _goal_seen(self) -> np.ndarray:
+        """Return the goal as the agent observes it."""
+        raise NotImplementedError
+
+    def _info(self) -> dict[str, Any]:
+        """Return facts about the present state, ``success`` among them."""
+        raise NotImplementedError
+
+    def _outcome(
+        self, nearer: float
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Return the results of a step that brought the agent nearer to the goal."""
+        info = self._info()
+        success = info["success"]
+        truncated = not success and self._steps >= self.config.max_steps
+        self._over = success or truncated
+        reward = nearer + (self.config.success_reward if success else 0.0)
+        return self._observation(), reward, success, truncated, info
 
 
 def observation_space(config: HouseConfig) -> gymnasium.spaces.Dict:
@@ -54,11 +127,7 @@ def action_space(config: HouseConfig) -> gymnasium.Space:
 
 
 def require_action(config: HouseConfig, action: Any) -> np.ndarray:
-    """Return an action as (dx, dy, dyaw), float64.
-
-    Args:
-        config: defines the action space.
-        action: 0, 1 or 2; or three numbers.
+    """Return an action of the configured space (0, 1 or 2; or three numbers) as dx, dy, dyaw.
 
     Raises:
         UserError: it is not in the space, or not finite.
@@ -97,11 +166,9 @@ def planar_of(world_from_camera: np.ndarray) -> np.ndarray:
 
 
 def frames_of(observations: Sequence[Mapping[str, Any]], intrinsics_4: np.ndarray) -> Frames:
-    """Return observations as frames, for ``worlds.start`` and ``worlds.observe``.
+    """Return observations, the present last, as frames for ``worlds.start`` and ``worlds.observe``.
 
-    Args:
-        observations: S ≥ 1 observations, in order; the last one is the present.
-        intrinsics_4: (4,) fx, fy, cx, cy: ``env.unwrapped.intrinsics_4``.
+    ``intrinsics_4`` are fx, fy, cx, cy: ``env.unwrapped.intrinsics_4``.
 
     Raises:
         UserError: there are none.

@@ -19,8 +19,8 @@ from pewm_jax.config import UserError
 from pewm_jax.data.simulator import move
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table
 from pewm_jax.planning import scores
-from pewm_jax.planning.extra import gymnasium
 from pewm_jax.planning.house import HouseEnv
+from pewm_jax.planning.observations import gymnasium
 
 TURN_STEPS = 0.25
 """Cost of a turn, in forward steps."""
@@ -31,14 +31,11 @@ SAME_M = 0.05
 
 
 def actions(env: gymnasium.Env) -> list[Any]:
-    """Return the actions from the agent's pose to the goal.
+    """Return the actions from the agent's pose to the goal, for a house within an episode.
 
     A* over forward steps and turns, guided by the geodesic distance; the house is deterministic, so
     these actions reach the goal. For a house with continuous actions they are the rows of the
     discrete actions' table.
-
-    Args:
-        env: a house within an episode, wrapped or not.
 
     Raises:
         UserError: it is not a house, no episode has started, or steps of this length and angle

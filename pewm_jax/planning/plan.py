@@ -97,14 +97,7 @@ def search(
 ) -> Plan:
     """Plan with a cost that JAX can trace; pure: jit it, vmap it over keys and goals.
 
-    NaN costs count as worst; ``plan`` raises an error for them.
-
-    Args:
-        planner: the planner.
-        config: the size of the search.
-        cost_of_actions: see ``Cost``.
-        key: randomness.
-        start: see ``planners.init``.
+    NaN costs count as worst; ``plan`` raises an error for them. ``start``: see ``planners.init``.
     """
 
     def step(search: Search, number: Array) -> tuple[Search, Rounds]:
@@ -222,12 +215,9 @@ def _restore(arrays: dict[str, np.ndarray] | None, begun: Search) -> tuple[Searc
 
 
 def checked(costs: Any, count: int, number: int | None = None) -> np.ndarray:
-    """Return costs as (K,) float32 numbers.
+    """Return the costs of K = ``count`` candidates as (K,) float32 numbers.
 
-    Args:
-        costs: the result of a cost.
-        count: K.
-        number: the round, for the message, if there are rounds.
+    ``number`` is the round, for the message, if there are rounds.
 
     Raises:
         UserError: they are of another shape, NaN, or −inf.

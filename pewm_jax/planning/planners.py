@@ -63,12 +63,9 @@ class Search:
 def init(planner: Planner, config: PlanConfig, start: Array | None = None) -> Search:
     """Return the initial state of a search.
 
-    Args:
-        planner: the planner.
-        config: the size of a plan.
-        start: (h,) discrete choices or (h, A) continuous ones to start around, such as the rest of
-            an earlier plan (``shifted``); h < H leaves the last blocks open. None starts with a
-            uniform distribution, or at the middle of the bounds.
+    ``start`` are (h,) discrete choices or (h, A) continuous ones to start around, such as the rest
+    of an earlier plan (``shifted``); h < H leaves the last blocks open. None starts with a uniform
+    distribution, or at the middle of the bounds.
 
     Raises:
         UserError: ``start`` has another shape.
@@ -120,14 +117,7 @@ def _belief_around(planner: Planner, belief: Any, start: Array, blocks: int) -> 
 
 
 def propose(planner: Planner, config: PlanConfig, search: Search, key: Array) -> Array:
-    """Draw (K, H) discrete or (K, H, A) continuous choices; the first is the belief's mode.
-
-    Args:
-        planner: the planner.
-        config: the size of a plan, and K.
-        search: the state of the search.
-        key: randomness.
-    """
+    """Draw (K, H) discrete or (K, H, A) continuous choices; the first is the belief's mode."""
     belief = search.belief
     shape = (config.candidates, config.horizon)
     drawn = _draw(planner, belief, shape, key)
@@ -154,15 +144,9 @@ def _draw(planner: Planner, belief: Any, shape: tuple[int, int], key: Array) -> 
 def update(
     planner: Planner, config: PlanConfig, search: Search, choices_KH: Array, costs_K: Array
 ) -> Search:
-    """Update the search with a round's costs.
+    """Update the search with the (K, H) or (K, H, A) choices of a round and their costs.
 
-    Args:
-        planner: the planner.
-        config: the number of elites.
-        search: the state of the search.
-        choices_KH: (K, H) or (K, H, A) choices.
-        costs_K: (K,) their costs, lower is better; NaN and inf count as worst. Duplicate choices
-            count once.
+    Lower costs are better; NaN and inf count as worst. Duplicate choices count once.
     """
     costs = jnp.where(jnp.isfinite(costs_K), costs_K, jnp.inf).astype(jnp.float32)
     least = jnp.argmin(costs)
@@ -237,12 +221,7 @@ def spread(space: Discrete | Box, belief: Any) -> Array:
 
 
 def actions_of(config: PlanConfig, choices: Array) -> Array:
-    """Return the actions (…, N) of choices (…, H): each block's is repeated.
-
-    Args:
-        config: ``action_block`` is used.
-        choices: (K, H, …) choices; a single plan needs a leading axis.
-    """
+    """Return the actions (K, N, …) of choices (K, H, …): each block's is repeated."""
     return jnp.repeat(choices, config.action_block, axis=1)
 
 

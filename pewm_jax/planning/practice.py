@@ -67,7 +67,7 @@ class FloorMap:
     def __init__(self) -> None:
         self._points = np.zeros((0, 3))
         self._cameras = np.zeros(0)
-        self._cells: set[tuple[int, int]] | None = None
+        self._cells: np.ndarray | None = None
 
     def add(self, frames: Frames) -> None:
         """Add (T,) posed depth; 0 is no measurement."""
@@ -87,27 +87,17 @@ class FloorMap:
 
     def free(self, start_xy: np.ndarray, end_xy: np.ndarray) -> bool:
         """Return whether the straight line between two points has no obstacle."""
-        cells = self._occupied()
-        reach = int(np.ceil(RADIUS_M / CELL_M)) + 1
-        around = np.arange(-reach, reach + 1)
-        for share in np.linspace(0, 1, WAY_SAMPLES)[1:]:
-            place = np.asarray(start_xy) + share * (np.asarray(end_xy) - np.asarray(start_xy))
-            middle = np.floor(place / CELL_M).astype(int)
-            for dx in around:
-                for dy in around:
-                    cell = int(middle[0] + dx), int(middle[1] + dy)
-                    if cell in cells:
-                        away = (np.array(cell) + 0.5) * CELL_M - place
-                        if np.hypot(*away) < RADIUS_M:
-                            return False
-        return True
+        start, end = np.asarray(start_xy), np.asarray(end_xy)
+        places = [start + share * (end - start) for share in np.linspace(0, 1, WAY_SAMPLES)[1:]]
+        away = self._occupied()[:, None] - np.stack(places)
+        return not (np.hypot(away[..., 0], away[..., 1]) < RADIUS_M).any()
 
-    def _occupied(self) -> set[tuple[int, int]]:
-        """Return the cells with obstacles, computed on first use."""
+    def _occupied(self) -> np.ndarray:
+        """Return the centres (n, 2) of cells with obstacles, computed on first use."""
         if self._cells is None:
             points = self._points
             if not len(points):
-                return set()
+                return np.zeros((0, 2))
             height = points[:, 2]
             floor = np.percentile(height, FLOOR_PERCENTILE)
             body = (height > floor + ABOVE_FLOOR_M) & (
@@ -116,7 +106,7 @@ class FloorMap:
             cells, counts = np.unique(
                 np.floor(points[body, :2] / CELL_M).astype(int), axis=0, return_counts=True
             )
-            self._cells = {(int(x), int(y)) for x, y in cells[counts >= LEAST_POINTS]}
+            self._cells = (cells[counts >= LEAST_POINTS] + 0.5) * CELL_M
         return self._cells
 
 
@@ -187,9 +177,9 @@ def walks(
         practice: number and length of walks.
         seed: seed of starts, goals and actions; equal seeds give equal starts in every environment.
 
-    Returns:
-        The walks, generated lazily; all have the same number of frames if the policy always
-        proposes the same number of actions.
+    Yields:
+        Walks with the same number of frames if the policy always proposes the same number of
+        actions.
 
     Raises:
         UserError: the policy does not return discrete actions.
@@ -215,13 +205,9 @@ def walks(
 
 
 class ImaginedEnvironment:
-    """A world as an environment for practice.
+    """A world as an environment for practice, started from posed RGB-D frames.
 
-    Args:
-        config: the world.
-        params: its weights.
-        seen: posed RGB-D frames with which it starts.
-        memory: if False, the world's memory is not used.
+    If ``memory`` is False, the world's memory is not used.
     """
 
     def __init__(self, config: Config, params: Params, seen: Frames, *, memory: bool = True):
@@ -261,10 +247,7 @@ class ImaginedEnvironment:
 class SimulatedEnvironment:
     """A simulator as an environment for practice: equally many real walks.
 
-    Args:
-        simulator: the house.
-        motion: the motion of an action.
-        seen: frames whose poses walks start from.
+    Walks start from the poses of the frames ``seen``; ``motion`` is that of an action.
     """
 
     def __init__(self, simulator: Simulator, motion: ActionConfig, seen: Frames):
@@ -299,11 +282,7 @@ def planar(world_from_camera: np.ndarray) -> np.ndarray:
 
 
 def require_discrete(actions_N: Any, who: str) -> np.ndarray:
-    """Return a copy of discrete actions (N,).
-
-    Raises:
-        UserError: they are not discrete actions.
-    """
+    """Return a copy of (N,) discrete actions, or raise UserError if they are none."""
     actions = np.array(actions_N)
     known = actions.dtype.kind in "iu" and actions.ndim == 1 and actions.size > 0
     if not known or not ((actions >= 0) & (actions < len(NAMES))).all():

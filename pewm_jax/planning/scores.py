@@ -23,10 +23,6 @@ LEAST_TASK_M = 0.25
 def ate(reference: ArrayLike, estimate: ArrayLike) -> float:
     """Return the absolute trajectory error: the root mean square distance of positions, metres.
 
-    Args:
-        reference: (T, 4, 4) or (T, 3), T ≥ 1.
-        estimate: of the same shape.
-
     Raises:
         UserError: the shapes do not fit, or values are not finite.
     """
@@ -36,13 +32,9 @@ def ate(reference: ArrayLike, estimate: ArrayLike) -> float:
 
 
 def rpe(reference: ArrayLike, estimate: ArrayLike) -> float:
-    """Return the relative pose error: root mean square translation error per step, metres.
+    """Return the relative pose error: root mean square translation error per step, metres, T ≥ 2.
 
     It compares the motion from each frame to the next, in the coordinates of the first of the two.
-
-    Args:
-        reference: (T, 4, 4) or (T, 3), T ≥ 2.
-        estimate: of the same shape.
 
     Raises:
         UserError: as for ``ate``.
@@ -72,7 +64,7 @@ def path_length(trajectory: ArrayLike) -> float:
 
 
 def sim(start: ArrayLike, final: ArrayLike, goal: ArrayLike) -> float:
-    """Return the similarity of a final pose to the goal, in percent.
+    """Return the similarity of a final pose to the goal, in percent; poses are (4, 4) or (3,).
 
     The paper reports a "SIM" without defining it. This definition is ours and is not comparable
     with the paper's::
@@ -84,11 +76,6 @@ def sim(start: ArrayLike, final: ArrayLike, goal: ArrayLike) -> float:
     100 is the goal itself. P measures the remaining distance relative to the task, so tasks of all
     lengths count equally; an agent that stays in place, or ends farther away, has P = 0. H is 0 for
     the opposite heading. An agent that does nothing in a task without a turn scores 50.
-
-    Args:
-        start: (4, 4) or (3,) initial pose.
-        final: final pose of the agent.
-        goal: pose of the goal.
 
     Raises:
         UserError: the shapes do not fit, or values are not finite.
@@ -108,13 +95,10 @@ def success(
 
 
 def spl(success: ArrayLike, shortest_m: ArrayLike, walked_m: ArrayLike) -> float:
-    """Return the mean success weighted by path length: S · L / max(P, L), from 0 to 1.
+    """Return the mean success weighted by path length, S · L / max(P, L), of N episodes, 0 to 1.
 
-    Args:
-        success: (N,) whether each episode succeeded, or one.
-        shortest_m: (N,) L, the shortest path from start to goal.
-        walked_m: (N,) P, the path walked. It may be shorter than L, because an episode ends within
-            a radius of the goal.
+    L is the shortest path from start to goal, P the path walked. It may be shorter than L, because
+    an episode ends within a radius of the goal.
 
     Raises:
         UserError: there are no episodes, the shapes differ, or a shortest path is not above 0.

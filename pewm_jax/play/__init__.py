@@ -12,7 +12,6 @@ saved     saved worlds and videos
 driver    a thread that handles requests, the newest step first; errors become messages
 picking   selection of a box on the screen
 map_view  the map in 3D
-panels    the status line and the panel of saved files
 serving   the server: its address, the browser, and rejection of pages of other sites
 page      the page, built with viser
 ========  ============================================================================

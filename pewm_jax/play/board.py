@@ -58,12 +58,7 @@ def pictures(engine: Engine, session: Session) -> Pictures:
 
 
 def board(shown: Pictures, name: str) -> np.ndarray:
-    """Draw a step as one uint8 image with even sides.
-
-    Args:
-        shown: the frames.
-        name: name of the model, for the caption.
-    """
+    """Draw a step of a model as one uint8 image with even sides."""
     tall, wide = shown.imagined.shape[:2]
     below = [("truth", shown.truth), ("without memory", shown.blind)]
     below = [(caption, image) for caption, image in below if image is not None]

@@ -353,12 +353,7 @@ TICK_S = 1.0
 
 @contextlib.contextmanager
 def ticking(text: str, log: Callable[[str], None]) -> Iterator[None]:
-    """Report the present work and its duration once a second, while the block runs.
-
-    Args:
-        text: description of the work.
-        log: receives the messages, also from another thread.
-    """
+    """Report the present work and its duration once a second, also from another thread."""
     begun, ended = time.monotonic(), threading.Event()
     log(f"{text.capitalize()} …")
 

@@ -24,13 +24,7 @@ _move = jax.jit(worlds.move, static_argnums=0, static_argnames="leave")
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Engine:
-    """A trained world model.
-
-    Attributes:
-        name: its name, for display.
-        config: the experiment.
-        params: its parameters, on the device.
-    """
+    """A trained world model: its name for display, the experiment, its parameters on the device."""
 
     name: str
     config: Config
@@ -67,11 +61,7 @@ class Engine:
         return self.model.sample_steps
 
     def with_sampler_steps(self, steps: int) -> Engine:
-        """Return the same model with another number of sampler steps.
-
-        Raises:
-            ConfigError: the sampler does not support this number.
-        """
+        """Return the same model with another number of sampler steps, or raise ConfigError."""
         require(self.sampler_steps > 0, f"{self.name} has no sampler with a number of steps.")
         model = self.model.with_sample_steps(steps)
         return dataclasses.replace(self, config=dataclasses.replace(self.config, model=model))

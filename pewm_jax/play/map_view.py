@@ -9,7 +9,7 @@ import numpy as np
 
 from pewm_jax.play import picking
 from pewm_jax.play.engine import Engine
-from pewm_jax.play.extra import viser
+from pewm_jax.play.serving import viser
 from pewm_jax.play.session import Session, pose
 
 DARK, PATH, IMAGINED, BOX, GOAL = (
@@ -27,11 +27,7 @@ FRUSTUM_M, WIDE = 0.3, 1.5
 
 
 class MapView:
-    """The 3D scene of a page.
-
-    Attributes:
-        box_23: (2, 3) the selected box, metres, or None.
-    """
+    """The 3D scene of a page, with the selected box: ``box_23``, (2, 3) metres, or None."""
 
     def __init__(self, server: viser.ViserServer):
         self._server, self._lock = server, threading.RLock()
@@ -84,13 +80,7 @@ class MapView:
         return self._points
 
     def show(self, engine: Engine, session: Session, image: np.ndarray | None = None) -> None:
-        """Show a drive: its map, the agent, and its path.
-
-        Args:
-            engine: the model.
-            session: the drive.
-            image: the agent's frame, uint8, drawn into its frustum.
-        """
+        """Show a drive: its map, the agent with its frame (uint8) in the frustum, and its path."""
         with self._lock:
             before, self._session, self._engine = self._session, session, engine
             with self._server.atomic():

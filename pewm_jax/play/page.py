@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import html
 import io
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,11 +19,10 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.config import ActionConfig
-from pewm_jax.play import board, panels, picking, serving, session
+from pewm_jax.play import board, picking, serving, session
 from pewm_jax.play.driver import Driver
-from pewm_jax.play.extra import viser
 from pewm_jax.play.map_view import MapView, eye_of
-from pewm_jax.play.panels import FilesPanel
+from pewm_jax.play.serving import viser
 from pewm_jax.play.session import PageUpdate, Request
 from pewm_jax.play.settings import Serve, Start
 from pewm_jax.report.pictures import as_bytes
@@ -67,12 +68,7 @@ the listeners of the root element, which are the hotkeys, run before that."""
 
 
 class Page:
-    """A served page; ``close`` ends it.
-
-    Attributes:
-        url: its address.
-        driver: its driver.
-    """
+    """A page served at ``url`` with its driver; ``close`` ends it."""
 
     def __init__(
         self,
@@ -96,7 +92,7 @@ class Page:
         Raises:
             ConfigError: the page cannot be served at the address.
         """
-        self._start, self._seconds, self._tell = start, None, panels.Terminal(log)
+        self._start, self._seconds, self._tell = start, None, Terminal(log)
         self._server = serving.server(serve, log)
         # Sharing would ask an external server for a public address; this page stays local.
         self._server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
@@ -140,7 +136,7 @@ class Page:
             if shown.picture is not None:
                 self._view.image = shown.picture
             self._busy.visible = shown.busy
-            self._status.content = panels.status_line(shown, self._seconds, len(self._map.points))
+            self._status.content = status_line(shown, self._seconds, len(self._map.points))
         if shown.session is not None and shown.engine is not None:
             seen = as_bytes(np.asarray(shown.session.world.frame.rgb_THWC[0]))
             self._map.show(shown.engine, shown.session, seen)
@@ -291,3 +287,88 @@ class Page:
             self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))
             self._steps.value = count
         self._files.show(shown)
+
+
+SAY_AGAIN_S = 10.0
+"""Seconds after which the terminal repeats the message of the present work."""
+
+
+class Terminal:
+    """Prints the page's present work and its errors to the terminal."""
+
+    def __init__(self, log: Callable[[str], None]):
+        self._log, self._phase, self._reported = log, "", 0.0
+
+    def __call__(self, shown: PageUpdate) -> None:
+        """Print an update of the driver if it is new."""
+        phase = shown.said.partition(" …")[0] if shown.busy or shown.failed else ""
+        late = shown.busy and time.monotonic() - self._reported >= SAY_AGAIN_S
+        if phase and (phase != self._phase or late):
+            self._log(shown.said if shown.busy else f"error: {phase}")
+            self._reported = time.monotonic()
+        if self._phase.startswith("Preparing") and not phase:
+            self._log("Ready.")
+        self._phase = phase
+
+
+def status_line(shown: PageUpdate, seconds: float | None, points: int) -> str:
+    """Return the status line as HTML.
+
+    ``seconds`` is the duration of the last step, if there was one; ``points`` the number of points
+    shown in the map.
+    """
+    colour = "#ff8a80" if shown.failed else "#60c8ff" if shown.busy else "#7fe0a0"
+    said = html.escape(shown.said)
+    facts = []
+    if shown.engine is not None and shown.engine.sampler_steps:
+        facts.append(f"{shown.engine.sampler_steps} sampler steps")
+    if seconds is not None:
+        facts.append(f"last step {seconds:.2f} s")
+    if points:
+        facts.append(f"{points:,} points")
+    if shown.recording:
+        facts.append("<span style='color:#ff8a80'>● recording</span>")
+    return (
+        "<div style='padding:2px 12px 6px;min-height:74px'>"
+        f"<div style='display:flex;gap:8px;line-height:1.35;font-size:14px'>"
+        f"<span style='color:{colour}'>●</span><span>{said or 'Ready.'}</span></div>"
+        "<div style='opacity:.6;font-size:12px;margin:6px 0 0 17px'>"
+        f"{' · '.join(facts)}</div></div>"
+    )
+
+
+class FilesPanel:
+    """The controls of saved worlds and videos; ``show`` updates them."""
+
+    def __init__(self, server: viser.ViserServer, put: Callable[[Request], None]):
+        """Add it to a page; ``put`` receives the requests."""
+        gui = server.gui
+        with gui.add_folder("Worlds and videos", expand_by_default=False):
+            name = gui.add_text("Name", "my world")
+            save = gui.add_button("Save this world", icon=viser.Icon.DEVICE_FLOPPY)
+            self._worlds: Any = gui.add_dropdown("Saved", ("none yet",))
+            load = gui.add_button("Open it", icon=viser.Icon.FOLDER_OPEN)
+            self._record = gui.add_button("Record a video", icon=viser.Icon.VIDEO, color="red")
+            self._file = gui.add_button("Download", icon=viser.Icon.DOWNLOAD, visible=False)
+        self._link: Path | None = None
+        self._recording = False
+        save.on_click(lambda _: put(session.Save(name.value)))
+        load.on_click(lambda _: put(session.Load(self._worlds.value)))
+        self._record.on_click(lambda _: put(session.Record(not self._recording)))
+
+        @self._file.on_click
+        def _(event: Any) -> None:
+            if self._link is not None and self._link.is_file() and event.client is not None:
+                event.client.send_file_download(self._link.name, self._link.read_bytes())
+
+    def show(self, shown: PageUpdate) -> None:
+        """Show the saved worlds, whether a video is being recorded, and the last file written."""
+        options = shown.worlds or ("none yet",)
+        if options != self._worlds.options:
+            self._worlds.options = options
+        if shown.recording != self._recording:
+            self._recording = shown.recording
+            self._record.label = "End the video" if shown.recording else "Record a video"
+        if shown.link is not None:
+            self._link = shown.link
+            self._file.label, self._file.visible = f"Download {shown.link.name}", True

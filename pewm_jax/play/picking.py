@@ -46,13 +46,8 @@ def in_rectangle(
 ) -> np.ndarray | None:
     """Return the (2, 3) box of the points seen in a rectangle of the screen, or None.
 
-    Floor points are ignored unless there are no others, and hidden points always.
-
-    Args:
-        points_N3: the points of the map, metres.
-        eye: the camera that shows it.
-        low_2: upper left corner of the rectangle, from 0 to 1 across and down.
-        high_2: lower right corner.
+    Floor points are ignored unless there are no others, and hidden points always. The rectangle's
+    upper left and lower right corner are from 0 to 1 across and down.
     """
     local = (points_N3 - eye.position_3) @ eye.rotation_33
     depth = np.where(local[:, 2] > 1e-3, local[:, 2], np.inf)
@@ -94,11 +89,6 @@ def at_click(
     """Return the (2, 3) box around the first point that a screen ray hits; None if it hits nothing.
 
     The box stands just above the floor.
-
-    Args:
-        points_N3: the points of the map, metres.
-        origin_3: origin of the ray.
-        direction_3: direction of the ray.
     """
     if not len(points_N3):
         return None

@@ -46,12 +46,7 @@ class StartPoint:
 
 
 def open_place(start: Start, height: int, width: int) -> StartPoint:
-    """Open the scene in which a drive starts.
-
-    Args:
-        start: the settings.
-        height: height of the model's images, pixels.
-        width: width of the model's images, pixels.
+    """Open the scene in which a drive starts, for images of this size.
 
     Raises:
         UserError: the scene does not exist or cannot be used.
@@ -77,11 +72,7 @@ def open_place(start: Start, height: int, width: int) -> StartPoint:
 
 
 def require_shown(model: World, start: Start) -> None:
-    """Raise an error if a drive would start with other images than a world was trained on.
-
-    Args:
-        model: the world.
-        start: the requested start.
+    """Refuse to start a drive with other images than the world was trained on.
 
     Raises:
         UserError: the world was trained on images of blocks, but the drive starts with surfaces.
@@ -116,12 +107,6 @@ def walk(
 
     The agent slides along walls. An agent outside the free area (after driving through walls) can
     go anywhere.
-
-    Args:
-        place: the start point of the drive.
-        planar_3: x, y, yaw.
-        action_3: dx, dy, dyaw, see ``types``.
-        walls: whether walls block the agent.
     """
     simulator = place.simulator
     if walls and simulator is not None and bool(is_free(simulator.grid, planar_3[:2])):
@@ -141,14 +126,7 @@ def action_between(before_3: np.ndarray, after_3: np.ndarray) -> np.ndarray:
 
 
 def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: float) -> np.ndarray:
-    """Return (n, 3) equal actions from one planar pose to another, at most one step each.
-
-    Args:
-        before_3: x, y, yaw.
-        after_3: x, y, yaw.
-        step_m: longest step, metres.
-        turn_deg: largest turn, degrees.
-    """
+    """Return (n, 3) equal actions from one planar pose to another, at most one step each."""
     far = float(np.linalg.norm(after_3[:2] - before_3[:2]))
     turn = _wrap_angle(float(after_3[2] - before_3[2]))
     parts = int(max(np.ceil(far / step_m - 1e-6), np.ceil(abs(turn) / np.radians(turn_deg) - 1e-6)))
@@ -159,13 +137,7 @@ def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: floa
 
 
 def fitted(frames: Frames, height: int, width: int) -> Frames:
-    """Centre-crop frames to an aspect ratio, and resize them and their intrinsics.
-
-    Args:
-        frames: NumPy frames, rgb uint8.
-        height: new height, pixels.
-        width: new width, pixels.
-    """
+    """Centre-crop NumPy frames to an aspect ratio, and resize them and their intrinsics."""
     tall, wide = frames.depth_THW.shape[1:]
     if (tall, wide) == (height, width):
         return frames

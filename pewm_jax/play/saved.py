@@ -28,11 +28,7 @@ def names(folder: Path) -> list[str]:
 
 
 def path_of(folder: Path, name: str) -> Path:
-    """Return a world's file.
-
-    Raises:
-        ConfigError: the name is not plain, so it could point outside the folder.
-    """
+    """Return a world's file, or refuse a name that could point outside the folder."""
     plain = re.fullmatch(r"\w[\w \-]*", name) is not None and len(name) <= MOST_NAME
     require(
         plain, f"{name!r} is not a valid name of a world: use letters, digits, spaces and hyphens."
@@ -41,13 +37,9 @@ def path_of(folder: Path, name: str) -> Path:
 
 
 def save(engine: Engine, world: WorldState, folder: Path, name: str) -> Path:
-    """Write a world: its present frame and its map.
+    """Write a world: its present frame and its map; one of the same name is replaced.
 
-    Args:
-        engine: the model it belongs to; the settings of its clip and memory are stored in the file.
-        world: the world.
-        folder: the folder; it is created if necessary.
-        name: a plain name; a world of this name is replaced.
+    The settings of the model's clip and memory are stored in the file.
 
     Raises:
         ConfigError: the name is not plain.
@@ -59,13 +51,7 @@ def save(engine: Engine, world: WorldState, folder: Path, name: str) -> Path:
 
 
 def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldState:
-    """Read a world written by ``save``.
-
-    Args:
-        engine: the model to drive it with.
-        like: a world of that model, which defines the shapes.
-        folder: the folder.
-        name: its name.
+    """Read a world written by ``save``, with the shapes of ``like``.
 
     Raises:
         UserError: it does not exist, is damaged, or belongs to a model with another memory.
@@ -102,12 +88,7 @@ class DriveFilm:
     """A video that is being recorded; its name is the next free number."""
 
     def __init__(self, folder: Path, picture_HWC: np.ndarray):
-        """Start a video.
-
-        Args:
-            folder: the folder of the video; it is created if necessary.
-            picture_HWC: the first frame, uint8.
-        """
+        """Start a video in a folder with its first frame, uint8."""
         folder.mkdir(parents=True, exist_ok=True)
         numbers = [path.stem.removeprefix("drive-") for path in folder.glob("drive-*.mp4")]
         number = 1 + max((int(text) for text in numbers if text.isdigit()), default=0)

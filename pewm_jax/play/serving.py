@@ -21,13 +21,18 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
-import websockets.asyncio.server
-from websockets.datastructures import Headers
-from websockets.http11 import Request, Response
-
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.play.extra import viser
 from pewm_jax.play.settings import LOOPBACK, Serve
+
+try:
+    import viser
+    import viser.transforms
+    import websockets.asyncio.server
+    from websockets.http11 import Request
+except ImportError:
+    raise UserError(
+        "the live viewer needs viser, which is not installed: pip install 'pewm-jax[play]'."
+    ) from None
 
 
 def open_in_browser(url: str) -> bool:
@@ -56,9 +61,7 @@ def here(host: str) -> str:
 def server(serve: Serve, log: Callable[[str], None] = lambda _: None) -> viser.ViserServer:
     """Start the server, without viser's own message; reject pages of other sites.
 
-    Args:
-        serve: address, port and names.
-        log: receives the reasons for rejections.
+    ``log`` receives the reasons for rejections.
 
     Raises:
         ConfigError: the host is not an address of this machine; viser would wait for it forever.
@@ -138,12 +141,7 @@ def refuse_other_sites(
     """Make websocket servers started inside the block check requests and reject with 403.
 
     viser starts its server internally and has no hook for such a check, so the function that starts
-    it is replaced inside the block.
-
-    Args:
-        here: the host served on.
-        names: further allowed names, as for ``rejection_reason``.
-        log: receives each reason once.
+    it is replaced inside the block. ``log`` receives each reason once.
 
     Yields:
         A list with an entry for each server that checks.
@@ -163,7 +161,7 @@ def refuse_other_sites(
             if reason not in reported and len(reported) < MOST_REPORTED:
                 reported.add(reason)
                 log(f"refused: {reason}")
-            return _forbidden(reason)
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{reason}\n")
 
         servers.append(process)
         return plain(*args, process_request=process, **rest)
@@ -173,15 +171,6 @@ def refuse_other_sites(
         yield servers
     finally:
         home.serve = plain  # type: ignore[assignment]
-
-
-def _forbidden(reason: str) -> Response:
-    body = f"{reason}\n".encode()
-    headers = Headers([("Content-Type", "text/plain; charset=utf-8")])
-    headers["Content-Length"] = str(len(body))
-    headers["Connection"] = "close"
-    status = http.HTTPStatus.FORBIDDEN
-    return Response(status.value, status.phrase, headers, body)
 
 
 def _parts(address: str) -> SplitResult | None:

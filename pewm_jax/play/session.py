@@ -31,11 +31,7 @@ STILL = np.zeros(3, np.float32)
 
 @dataclasses.dataclass(frozen=True)
 class Drive:
-    """Event: one step.
-
-    Attributes:
-        action: dx, dy, dyaw: metres forward, metres left, radians counter-clockwise.
-    """
+    """Event: one step, (dx, dy, dyaw): metres forward and left, radians counter-clockwise."""
 
     action: tuple[float, float, float]
 
@@ -140,11 +136,7 @@ def apply(
 ) -> Session:
     """Return the drive after an event.
 
-    Args:
-        engine: the model.
-        session: the drive so far.
-        event: the event.
-        made: the result of ``ahead`` for this session and this event's action, if there is one.
+    ``made`` is the result of ``ahead`` for this session and this event's action, if there is one.
 
     Raises:
         UserError: the box is empty, or the memory cannot be edited.

@@ -18,7 +18,6 @@ import logging
 import os
 import sys
 import time
-import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Self
@@ -32,9 +31,9 @@ from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
 from pewm_jax.io import tree
 from pewm_jax.train import checkpoint_files, processes, runs
-from pewm_jax.train.stages import Stage
 from pewm_jax.train.step import TrainState, inference_params
 from pewm_jax.types import Params
+from pewm_jax.worlds.stages import Stage
 
 WEIGHTS_ITEM = checkpoint_files.WEIGHTS_ITEM
 STATE_ITEM, DATA_ITEM, CONFIG_ITEM = "state", "data", "config"
@@ -49,14 +48,8 @@ class Checkpoints:
     On construction, damaged checkpoints newer than the newest intact one are moved aside. All
     processes of a job construct this, and call its methods in the same order.
 
-    Args:
-        run: the run's folder.
-        config: the experiment; saved in each checkpoint.
-        stage: the stage.
-        log: prints a line, for example about a damaged checkpoint.
-
     Raises:
-        UserError: checkpoints exist, and all are damaged.
+        UserError: checkpoints exist, and all are damaged; or one cannot be written.
     """
 
     def __init__(self, run: Path, config: Config, stage: Stage, log: Callable[[str], None] = print):
@@ -74,12 +67,7 @@ class Checkpoints:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         try:
             with self._writing():
                 try:
@@ -101,11 +89,7 @@ class Checkpoints:
         return self._latest
 
     def save(self, state: TrainState) -> None:
-        """Copy the state to the host and write it in the background.
-
-        Raises:
-            UserError: this checkpoint, or the previous one in the background, cannot be written.
-        """
+        """Copy the state to the host and write it in the background; wait for the previous one."""
         self.wait()
         step = int(state.step)
         if step == self._latest:
@@ -135,11 +119,7 @@ class Checkpoints:
         self._interval, self._began, self._settled = now - self._began, now, False
 
     def wait(self, seconds: float | None = None) -> None:
-        """Block until all writes are on disk, or ``seconds`` have passed.
-
-        Raises:
-            UserError: as ``save``.
-        """
+        """Block until all writes are on disk, or ``seconds`` have passed."""
         if self._finishing is None:
             return
         concurrent.futures.wait([self._finishing], seconds)
@@ -154,19 +134,13 @@ class Checkpoints:
         So a reported step is at most one save interval ahead of the newest complete checkpoint: a
         killed run loses no more than that. The wait ends after two seconds or a fiftieth of the
         interval, whichever is longer.
-
-        Raises:
-            UserError: as ``save``.
         """
         reasonable = max(_MOMENT_S, _SHARE * self._interval)
         self.wait(0 if self._settled else reasonable)
         self._settled = True
 
     def restore(self, like: TrainState) -> TrainState:
-        """Restore the newest checkpoint.
-
-        Args:
-            like: the abstract state; arrays are restored with its shardings.
+        """Restore the newest checkpoint, with the shardings of the abstract state ``like``.
 
         Raises:
             UserError: there is no checkpoint, it belongs to another configuration, or it cannot be
@@ -194,12 +168,8 @@ class Checkpoints:
     def publish(self, params: Params) -> None:
         """Write the newest checkpoint's weights to the run's ``weights.safetensors``.
 
-        Args:
-            params: those weights. Used if there is one process; otherwise process 0 reads them
-                from the checkpoint into host memory.
-
-        Raises:
-            UserError: as ``save``.
+        ``params`` are those weights. They are used if there is one process; otherwise process 0
+        reads them from the checkpoint into host memory.
         """
         self.wait()
         step, alone = self._require_step(), jax.process_count() == 1
@@ -247,7 +217,7 @@ class Checkpoints:
         return self._latest
 
     def _read(self, items: dict[str, Any]) -> Any:
-        """Read items of the newest checkpoint; raise UserError if its configuration differs."""
+        """Read items of the newest checkpoint, which must have this configuration."""
         self.wait()
         folder = self.folder / str(self._require_step())
         with _reading(folder):
@@ -262,14 +232,9 @@ class Checkpoints:
 
 
 def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[Config, Params]:
-    """Read only the inference weights of a checkpoint.
+    """Read the experiment and only the inference weights, NumPy arrays, of one checkpoint's folder.
 
-    Args:
-        folder: the checkpoint, such as ``runs/demo/checkpoints/stage1/200``.
-        like: called with the experiment and the stage's number for the shapes of the weights.
-
-    Returns:
-        The experiment and the weights, as NumPy arrays.
+    ``like`` is called with the experiment and the stage's number for the shapes of the weights.
 
     Raises:
         UserError: the weights are damaged.

@@ -64,23 +64,16 @@ def writing(folder: Path, step: int) -> Path:
 
 
 def put(folder: Path, step: int) -> None:
-    """Write the manifest of a complete checkpoint, then rename it; from then on it counts.
-
-    Raises:
-        OSError: the manifest cannot be written or the folder cannot be renamed.
-    """
+    """Write the manifest of a complete checkpoint, then rename it; from then on it counts."""
     seal(writing(folder, step))
     writing(folder, step).rename(folder / str(step))
     sync(folder)
 
 
 def prune(folder: Path, keep: int, keep_every: int) -> None:
-    """Delete old checkpoints.
+    """Delete all but the ``keep`` newest checkpoints.
 
-    Args:
-        folder: the stage's checkpoints.
-        keep: number of newest checkpoints to keep.
-        keep_every: also keep multiples of this many steps; 0 for none.
+    Multiples of ``keep_every`` steps are kept, too; 0 for none.
     """
     for step in steps(folder)[:-keep]:
         if keep_every == 0 or step % keep_every:
@@ -97,14 +90,9 @@ def clear(folder: Path) -> None:
 
 
 def newest(folder: Path, log: Callable[[str], None]) -> int | None:
-    """Return the step of the newest intact checkpoint; move newer, damaged ones to ``damaged/``.
+    """Return the step of the newest intact checkpoint, or None if there is none.
 
-    Args:
-        folder: the stage's checkpoints.
-        log: called with a sentence for each one moved.
-
-    Returns:
-        The step, or None if the folder has no checkpoint.
+    Newer, damaged ones are moved to ``damaged/``; ``log`` gets a sentence for each.
 
     Raises:
         UserError: all are damaged.
@@ -146,14 +134,7 @@ _EVERY_S = 10.0
 
 
 def seal(folder: Path) -> None:
-    """Write the manifest of a folder, and flush the folder to disk.
-
-    Args:
-        folder: a complete folder.
-
-    Raises:
-        OSError: the manifest cannot be written.
-    """
+    """Write the manifest of a complete folder, and flush the folder to disk."""
     paths = _files(folder)
     files = {
         name: {"bytes": paths[name].stat().st_size, "sha256": digest}
@@ -172,10 +153,10 @@ def flaws(
     parts: Iterable[str] = (),
     log: Callable[[str], None] = lambda _: None,
 ) -> list[str]:
-    """Compare a folder with its manifest.
+    """Compare a folder with the manifest that ``seal`` wrote.
 
     Args:
-        folder: a folder that ``seal`` was called on.
+        folder: the folder.
         parts: verify only these subfolders; all files by default.
         log: prints progress if verification takes seconds.
 

@@ -156,9 +156,8 @@ CHIPS = (
 def find(device_kind: str) -> Chip | None:
     """Return the chip of a device kind, or None if it is unknown.
 
-    Args:
-        device_kind: ``jax.devices()[0].device_kind``, such as "NVIDIA H200" or "TPU v6 lite", or a
-            common spelling, such as "h200" or "tpu-v5p".
+    The kind is ``jax.devices()[0].device_kind``, such as "NVIDIA H200" or "TPU v6 lite", or a
+    common spelling, such as "h200" or "tpu-v5p".
     """
     plain = " ".join(re.split(r"[\s_-]+", device_kind.strip()))
     for chip in CHIPS:
@@ -168,11 +167,7 @@ def find(device_kind: str) -> Chip | None:
 
 
 def named(name: str) -> Chip:
-    """Return the chip with the name given by ``--chip``.
-
-    Raises:
-        ConfigError: the name is unknown.
-    """
+    """Return the chip with the name given by ``--chip``; raise ConfigError if it is unknown."""
     chip = find(name)
     if chip is None:
         known = ", ".join(chip.name for chip in CHIPS)

@@ -8,7 +8,6 @@ import itertools
 import json
 import queue
 import threading
-import types
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -22,10 +21,11 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import read_manifest
 from pewm_jax.io import atomic, tensor_files, tree
 from pewm_jax.io.progress import Meter
-from pewm_jax.train.stages import Stage
 from pewm_jax.types import Clip, Params
+from pewm_jax.worlds.stages import Stage
 
 AHEAD = 2
+"""Number of batches kept ready on the devices."""
 _POLL_S = 0.2
 
 
@@ -34,23 +34,13 @@ def rows_of(where: Sharding, batch: int) -> slice:
 
     Processes whose devices need the same rows (they share a clip's tokens or heads) get the same
     slice. If the mesh interleaves processes, the slice includes rows of other processes.
-
-    Args:
-        where: the sharding of the batch.
-        batch: the global batch size.
     """
     held = _rows_on_process(where, batch)
     return slice(int(held[0]), int(held[-1]) + 1)
 
 
 def place(clip: Clip, where: Sharding, batch: int) -> Clip:
-    """Make a global batch from the rows that each process has read.
-
-    Args:
-        clip: the rows of this process (``rows_of``).
-        where: the sharding of every array.
-        batch: the global batch size.
-    """
+    """Make a global batch from the rows that each process has read (``rows_of``)."""
     held = _rows_on_process(where, batch)
     own = held - held[0]
     if len(own) <= own[-1]:  # JAX takes only the rows that the process owns
@@ -73,21 +63,13 @@ class Feed:
     Args:
         batches: the source; closed at the end if it has a ``close`` method.
         where: the sharding of every array of a batch.
-        batch: the global batch size if the source yields only this process's rows; None if there is
-            one process.
-        ahead: number of batches kept ready.
+        batch: the global batch size; the source yields only this process's rows.
     """
 
-    def __init__(
-        self,
-        batches: Iterator[Clip],
-        where: Sharding,
-        batch: int | None = None,
-        ahead: int = AHEAD,
-    ):
+    def __init__(self, batches: Iterator[Clip], where: Sharding, batch: int):
         self._batches = batches
         self._where, self._batch = where, batch
-        self._ready: queue.Queue[Clip | BaseException] = queue.Queue(ahead)
+        self._ready: queue.Queue[Clip | BaseException] = queue.Queue(AHEAD)
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._fill, name="feed", daemon=True)
 
@@ -95,12 +77,7 @@ class Feed:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._over.set()
         self._thread.join()
 
@@ -117,7 +94,7 @@ class Feed:
     def _fill(self) -> None:
         try:
             for batch in self._batches:
-                if not self._put(self._placed(batch)):
+                if not self._put(place(batch, self._where, self._batch)):
                     break
             else:
                 self._put(UserError("The training data ended before the last training step."))
@@ -127,11 +104,6 @@ class Feed:
             close = getattr(self._batches, "close", None)
             if close is not None:
                 close()
-
-    def _placed(self, clip: Clip) -> Clip:
-        if self._batch is None:
-            return jax.device_put(clip, self._where)
-        return place(clip, self._where, self._batch)
 
     def _put(self, item: Clip | BaseException) -> bool:
         """Wait for space in the queue; return False if training has ended."""
@@ -228,13 +200,7 @@ def start_digest(run: Path, stage: Stage, params: Params, done: int) -> str:
 
     A stage may train some of these weights: stage ``gate`` trains a part of the codec. So the
     digest is written into the run's folder before the first step, and read when the stage is
-    resumed.
-
-    Args:
-        run: the run's folder.
-        stage: the stage.
-        params: all parameters after ``done`` steps.
-        done: number of steps of the stage already done.
+    resumed. ``params`` are those after ``done`` steps.
     """
     file = run / PREPARED_DIGESTS
     known = json.loads(file.read_text("utf-8")) if file.is_file() else {}
@@ -256,13 +222,7 @@ def prepared_seed(config: Config, stage: Stage) -> int:
 
 
 def _folder(config: Config, stage: Stage, weights: str) -> Path:
-    """Return the folder of prepared clips; its name is a hash of all that they depend on.
-
-    Args:
-        config: the experiment.
-        stage: the stage.
-        weights: from ``start_digest``.
-    """
+    """Return the folder of prepared clips; its name is a hash of all that they depend on."""
     model = configuration.to_dict(config.model)
     if "backbone" not in stage.prepares_by:
         for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
@@ -320,15 +280,9 @@ def _map_file(file: Path, like: Clip) -> Clip:
 def draw_prepared(
     prepared: Sequence[Clip], batch: int, seed: int, start: int = 0
 ) -> Iterator[Clip]:
-    """Yield batches endlessly; batch k depends only on the seed and k.
+    """Yield batches of prepared clips endlessly; batch k depends only on the seed and k.
 
-    Each epoch contains every clip once, in a new order.
-
-    Args:
-        prepared: batches from ``prepare_clips``, with N clips in total.
-        batch: clips per batch, at most N.
-        seed: seed of the order.
-        start: number of the first batch.
+    Each epoch contains every clip once, in a new order. ``start`` is the number of the first batch.
     """
     sizes = [len(jax.tree.leaves(part)[0]) for part in prepared]
     places = [(part, row) for part, size in enumerate(sizes) for row in range(size)]

@@ -20,24 +20,20 @@ from pewm_jax import shipped
 from pewm_jax.config import Config, Settings, UserError
 from pewm_jax.io import weights
 from pewm_jax.memory import feature_cache
-from pewm_jax.train import checkpoint_files, processes, runs, stages
-from pewm_jax.train.stages import Stage, all_stages
+from pewm_jax.train import checkpoint_files, processes, runs
 from pewm_jax.types import Params
 from pewm_jax.worlds import rollouts
+from pewm_jax.worlds.stages import Stage
 
 
 def load(path: str | Path) -> tuple[Config, Params]:
-    """Load a world model.
+    """Load a world model: the experiment, and its averaged (EMA) inference weights in NumPy arrays.
 
     Args:
         path: one of: a run folder made by ``train.py``, finished or not (the newest weights are
             loaded; while a stage is being trained, those of its newest complete checkpoint); a
             checkpoint folder, such as ``runs/demo/checkpoints/stage1/200``; a folder of converted
             weights; the name of weights that ship with the library (``shipped.names()``).
-
-    Returns:
-        ``(config, params)``: the averaged (EMA) inference weights as NumPy arrays, in the dtype of
-        the file.
 
     Raises:
         UserError: a file is missing or damaged, or the weights do not fit the configuration.
@@ -70,7 +66,7 @@ def _checkpoints(run: Path) -> list[Path]:
     have = (int(facts.get("stage", 0)), int(facts.get("step", 0)))
     found: dict[tuple[int, int], Path] = {}
     config = configuration.load(run / runs.CONFIG)
-    for stage in stages.all_stages(config):
+    for stage in runs.all_stages(config):
         folder = checkpoint_files.of(run, stage.name)
         for step in checkpoint_files.steps(folder):
             found[stage.number, step] = folder / str(step)
@@ -85,8 +81,8 @@ def _read(folder: Path) -> tuple[Config, Params]:
 
 
 def _shapes(config: Config, number: int) -> Params:
-    """Return the shapes of a model's weights in a stage."""
-    stage = next(stage for stage in stages.all_stages(config) if stage.number == number)
+    """Return the shapes of all parameters of a stage."""
+    stage = next(stage for stage in runs.all_stages(config) if stage.number == number)
     return jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
 
 
@@ -108,7 +104,7 @@ def require_weights(config: Config) -> None:
 
     ``train.start`` names those of the model; the loss of a stage may need others.
     """
-    for stage in all_stages(config):
+    for stage in runs.all_stages(config):
         if stage.extra_weights is not None and stage.settings(config).steps > 0:
             stage.extra_weights(config.model, config.train)
     for where, part in _parts(config.model):
@@ -143,10 +139,11 @@ def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Pa
     params = _start_weights(config)
     if file.exists():  # a checkpoint is verified while it is read
         processes.run_on_process_0(lambda: weights.verify(file))
-    for later in _later_stages(config, stage):
-        extra = (
-            _stage_shapes(config, later).keys() - _stage_shapes(config, stage).keys()
-        ) & params.keys()
+    for later in runs.all_stages(config):
+        if later.number <= stage.number:
+            continue
+        later_only = _shapes(config, later.number).keys() - _shapes(config, stage.number).keys()
+        extra = later_only & params.keys()
         if extra:
             log(
                 f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are ignored; "
@@ -154,15 +151,6 @@ def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Pa
             )
         params = {name: part for name, part in params.items() if name not in extra}
     return params
-
-
-def _later_stages(config: Config, stage: Stage) -> list[Stage]:
-    return [one for one in all_stages(config) if one.number > stage.number]
-
-
-def _stage_shapes(config: Config, stage: Stage) -> Params:
-    """Return the shapes of all parameters of a stage."""
-    return jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
 
 
 def encoder(config: Config) -> Params:

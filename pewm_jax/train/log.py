@@ -1,8 +1,7 @@
 """Training logs: one JSON line and one TensorBoard event per logged step, and a live view.
 
-If ``train.wandb`` names a project, the same scalars are sent to Weights & Biases (``WandbLog``).
-
-The live view is a progress bar on a terminal, and otherwise a line every ten seconds.
+If ``train.wandb`` names a project, the same scalars are sent to Weights & Biases. The live view is
+a progress bar on a terminal, and otherwise a line every ten seconds.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import json
 import math
 import sys
 import time
-import types
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -27,7 +25,7 @@ from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
 from pewm_jax.io import atomic
 from pewm_jax.train import processes
-from pewm_jax.train.stages import Stage
+from pewm_jax.worlds.stages import Stage
 
 FLUSH_S = 10
 """Seconds between writes of TensorBoard events; JSON lines are written immediately."""
@@ -38,17 +36,11 @@ LINE_EVERY_S = 10.0
 class MetricsLog:
     """Appends scalars to ``metrics.jsonl`` and to TensorBoard; a context manager.
 
-    Lines logged after the step from which the run is resumed are dropped, so that every step has
-    one line. Only process 0 writes.
-
-    Args:
-        run: the run's folder.
-        stage: the stage about to be trained.
-        step: number of its steps already done.
-        config: the experiment, which may enable Weights & Biases; None disables it.
+    Lines logged after the step from which the run is resumed (``step`` steps of the stage are done)
+    are dropped, so that every step has one line. Only process 0 writes.
 
     Raises:
-        UserError: Weights & Biases is enabled and cannot start.
+        UserError: ``config`` enables Weights & Biases, which cannot start.
     """
 
     def __init__(self, run: Path, stage: Stage, step: int, config: Config | None = None):
@@ -61,7 +53,7 @@ class MetricsLog:
 
         self._wandb = None
         if config is not None and config.train.wandb:
-            self._wandb = WandbLog(config, run, stage)
+            self._wandb = start_wandb(config, run, stage)
         path = run / "metrics.jsonl"
         drop_after(path, stage.number, step)
         self._file = path.open("a")
@@ -74,12 +66,7 @@ class MetricsLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if not self._writes:
             return
         # Do not let a full disk mask the error being raised.
@@ -89,7 +76,7 @@ class MetricsLog:
             finally:
                 self._events.close()
                 if self._wandb is not None:
-                    self._wandb.close(failed=error is not None)
+                    self._wandb.finish(exit_code=int(error is not None))
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
         """Log the scalars of one step; NaN and infinity, which JSON lacks, become null."""
@@ -103,7 +90,7 @@ class MetricsLog:
         for name, value in finite.items():
             self._events.add_scalar(name, value, step)
         if self._wandb is not None:
-            self._wandb.write(step, finite)
+            self._wandb.log(finite, step=step)
 
 
 def drop_after(path: Path, stage: int, step: int) -> None:
@@ -145,14 +132,7 @@ class Pace:
 
 
 class LiveView:
-    """Shows progress, loss and speed of a stage; a context manager.
-
-    Args:
-        label: name of the stage.
-        total: number of its steps.
-        done: number of steps already done.
-        console: output; standard output by default.
-    """
+    """Shows progress, loss and speed of a stage of ``total`` steps; a context manager."""
 
     def __init__(self, label: str, total: int, done: int, console: Console | None = None):
         self._console = console or Console(file=sys.stdout, soft_wrap=True, highlight=False)
@@ -175,12 +155,7 @@ class LiveView:
             self._bar.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
@@ -241,11 +216,7 @@ ID = "wandb.id"
 
 
 def require_wandb() -> Any:
-    """Return the module ``wandb``.
-
-    Raises:
-        UserError: it is not installed.
-    """
+    """Return the module ``wandb``, or raise UserError if it is not installed."""
     try:
         return importlib.import_module("wandb")  # the import takes a second, so only on demand
     except ImportError:
@@ -255,45 +226,30 @@ def require_wandb() -> Any:
         ) from None
 
 
-class WandbLog:
-    """Sends the scalars of a stage to Weights & Biases; only one process of a job has one.
-
-    Args:
-        config: the experiment, sent as the run's config; ``train.wandb`` is the project.
-        run: the run's folder.
-        stage: the stage about to be trained.
+def start_wandb(config: Config, run: Path, stage: Stage) -> Any:
+    """Start or resume the run of a stage in the project ``train.wandb`` of Weights & Biases.
 
     Raises:
         UserError: the package is not installed, no user is logged in, or the run cannot be started.
     """
-
-    def __init__(self, config: Config, run: Path, stage: Stage):
-        wandb = require_wandb()
-        try:
-            self._run = wandb.init(
-                project=config.train.wandb,
-                name=f"{run.name} {stage.name}",
-                group=run.name,
-                id=f"{_id(run)}-{stage.name}",
-                resume="allow",
-                dir=str(run),
-                config=configuration.to_dict(config),
-                settings=wandb.Settings(console="off"),  # the live view prints already
-            )
-        except wandb.Error as error:
-            reason = " ".join(str(error).split()).rstrip(".")
-            raise UserError(
-                f"Weights & Biases cannot start ({reason}): run `wandb login` first, set "
-                "WANDB_MODE=offline to log locally only, or omit --train.wandb."
-            ) from None
-
-    def write(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Log the scalars of one step; a step that was logged before is not changed."""
-        self._run.log(dict(scalars), step=step)
-
-    def close(self, *, failed: bool) -> None:
-        """Flush and finish the run."""
-        self._run.finish(exit_code=int(failed))
+    wandb = require_wandb()
+    try:
+        return wandb.init(
+            project=config.train.wandb,
+            name=f"{run.name} {stage.name}",
+            group=run.name,
+            id=f"{_id(run)}-{stage.name}",
+            resume="allow",
+            dir=str(run),
+            config=configuration.to_dict(config),
+            settings=wandb.Settings(console="off"),  # the live view prints already
+        )
+    except wandb.Error as error:
+        reason = " ".join(str(error).split()).rstrip(".")
+        raise UserError(
+            f"Weights & Biases cannot start ({reason}): run `wandb login` first, set "
+            "WANDB_MODE=offline to log locally only, or omit --train.wandb."
+        ) from None
 
 
 def _id(run: Path) -> str:
@@ -310,10 +266,10 @@ SKIPPED = 2
 
 
 class Profile:
-    """Traces some steps of a stage with JAX's profiler; does nothing for 0 steps.
+    """Traces some steps of a stage with JAX's profiler, into ``profile/STAGE`` of the run's folder.
 
     Args:
-        run: the run's folder; the trace is written to ``profile/stage1`` in it.
+        run: the run's folder.
         stage: the stage.
         steps: number of steps to trace, 0 for none.
         first: the first step after starting or resuming.

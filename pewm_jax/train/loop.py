@@ -6,6 +6,7 @@ checkpoints are written in the background, so the devices never wait for the hos
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import functools
 import sys
@@ -22,7 +23,7 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.loader import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.train import flops, loading, processes, runs, sharding, stages
+from pewm_jax.train import flops, loading, processes, runs, sharding
 from pewm_jax.train import log as training_log
 from pewm_jax.train.checkpoint import Checkpoints
 from pewm_jax.train.feed import (
@@ -36,7 +37,6 @@ from pewm_jax.train.feed import (
 )
 from pewm_jax.train.log import LiveView, MetricsLog, Pace, Profile, duration
 from pewm_jax.train.signals import Stop
-from pewm_jax.train.stages import Stage
 from pewm_jax.train.step import (
     Metrics,
     TrainState,
@@ -49,6 +49,7 @@ from pewm_jax.train.step import (
 )
 from pewm_jax.train.watch import Preview, Samples, Watch
 from pewm_jax.types import Clip, Params
+from pewm_jax.worlds.stages import Stage
 
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
 """Error numbers of a full or failing disk."""
@@ -67,8 +68,7 @@ def train(
         config: the experiment; ``config.train.run`` is the output folder.
         preview: makes sample pictures every ``config.train.preview_every`` steps and at the end of
             a stage.
-        profile: number of steps to trace in each stage, written to ``profile/`` in the run's
-            folder.
+        profile: number of steps to trace in each stage (``log.Profile``).
         log: prints a line.
 
     Returns:
@@ -81,7 +81,7 @@ def train(
             ``train.grace_s``, or at a second signal, the process exits itself.)
     """
     config = runs.resumed(config, log if processes.is_primary() else _silent)
-    planned = stages.planned(config)
+    planned = runs.planned(config)
     loading.require_weights(config)
     if config.train.wandb:
         training_log.require_wandb()  # fail before the data are prepared
@@ -101,10 +101,8 @@ def train(
             return run
         weights: Params | None = None
         for stage in loading.remaining_stages(run, planned):
-            worker = _Worker(
-                config, stage, mesh, run, stop, bad=bad, preview=preview, profile=profile, log=log
-            )
-            worker.start, weights = weights, None  # freed once the state is made from them
+            worker = _Worker(config, stage, mesh, run, stop, bad, preview, profile, log, weights)
+            weights = None  # freed once the state is made from them
             weights = worker.train()
             if stop.requested and stage is not planned[-1]:
                 raise stop.interrupted(stage.title, stage.settings(config).steps)
@@ -121,6 +119,7 @@ def _silent(line: str) -> None:
     del line
 
 
+@dataclasses.dataclass
 class _Worker:
     """Trains one stage.
 
@@ -128,30 +127,24 @@ class _Worker:
         start: weights of the previous stage; None to use those in ``train.start``, if any.
     """
 
+    config: Config
+    stage: Stage
+    mesh: Mesh
+    path: Path
+    stop: Stop
+    bad: BadRecords
+    preview: Preview | None
+    profile: int
+    log: Callable[[str], None]
     start: Params | None = None
 
-    checkpoints: Checkpoints
-    view: LiveView
-    watch: Watch
-    samples: Samples
+    checkpoints: Checkpoints = dataclasses.field(init=False)
+    view: LiveView = dataclasses.field(init=False)
+    watch: Watch = dataclasses.field(init=False)
+    samples: Samples = dataclasses.field(init=False)
 
-    def __init__(
-        self,
-        config: Config,
-        stage: Stage,
-        mesh: Mesh,
-        run: Path,
-        stop: Stop,
-        *,
-        bad: BadRecords,
-        preview: Preview | None,
-        profile: int,
-        log: Callable[[str], None],
-    ):
-        self.config, self.stage, self.mesh, self.path = config, stage, mesh, run
-        self.like = abstract_state(config, stage, mesh)
-        self.stop, self.bad, self.preview, self.profile = stop, bad, preview, profile
-        self.log = log
+    def __post_init__(self):
+        self.like = abstract_state(self.config, self.stage, self.mesh)
 
     @property
     def settings(self) -> StageConfig:
@@ -172,22 +165,12 @@ class _Worker:
                 MetricsLog(run, stage, done, config) as metrics_log,
             ):
                 self.bad.log = self.view.log if processes.is_primary() else _print_error
+                devices = self.mesh.size
                 self.watch = Watch(
-                    config,
-                    stage,
-                    run,
-                    done,
-                    devices=self.mesh.size,
-                    view=self.view,
-                    log=metrics_log,
-                    bad=self.bad,
+                    config, stage, run, done, devices, self.view, metrics_log, self.bad
                 )
                 self.samples = Samples(
-                    config,
-                    stage,
-                    self.preview,
-                    log=self.view.log,
-                    unless_stopped=self.stop.unless_requested,
+                    config, stage, self.preview, self.view.log, self.stop.unless_requested
                 )
                 state = self.run(done)
             params = inference_params(stage, state)

@@ -18,8 +18,8 @@ from optax.contrib import MuonDimensionNumbers, scale_by_muon
 
 from pewm_jax.config import Config, StageConfig
 from pewm_jax.io import tree
-from pewm_jax.train.stages import FREEZE, TRAIN, Stage
 from pewm_jax.types import Params
+from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
 DECAYED = (
     (r"(.*/)?kernel", True),

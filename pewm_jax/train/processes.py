@@ -84,7 +84,7 @@ def start(launch: Join) -> None:
 
     If ``launch`` names no coordinator, JAX reads it from the environment (SLURM, Kubernetes, Cloud
     TPU, Open MPI). If not all processes have joined within ``launch.patience`` seconds, this
-    process prints an error and exits. Without ``--distributed`` nothing happens.
+    process prints an error and exits.
 
     Raises:
         UserError: there are no processes to join, or the coordinator's port is in use.
@@ -144,11 +144,7 @@ def barrier(name: str, patience_s: float = BARRIER_S) -> None:
 
 
 def agree(value: Any) -> Any:
-    """Return process 0's value in all processes.
-
-    Args:
-        value: any JSON-serializable value; ignored in other processes.
-    """
+    """Return process 0's value, which JSON can express, in all processes."""
     if jax.process_count() == 1:
         return value
     text = json.dumps(value).encode() if is_primary() else b""
@@ -158,10 +154,7 @@ def agree(value: Any) -> Any:
 
 
 def run_on_process_0(work: Callable[[], Any]) -> Any:
-    """Call a function in process 0 only, and return its result in all processes.
-
-    Args:
-        work: returns a JSON-serializable value.
+    """Call a function in process 0 only, and return its result, which JSON can express, in all.
 
     Raises:
         UserError: in all processes, if the function raises it or ``OSError`` in process 0.
@@ -204,12 +197,10 @@ def is_lost(error: BaseException) -> bool:
 
 
 def gather(tree: T) -> T:
-    """Gather arrays that are sharded over processes to process 0; called by all processes.
+    """Gather arrays that are sharded over processes to process 0, as NumPy arrays; called by all.
 
-    Leaves are gathered one by one, so no device holds more than one gathered array.
-
-    Returns:
-        In process 0 the same tree with NumPy arrays, in the others a tree of empty arrays.
+    Leaves are gathered one by one, so no device holds more than one gathered array. In the other
+    processes the arrays are empty.
     """
     if jax.process_count() == 1:
         return tree
@@ -240,14 +231,10 @@ class Votes:
         self._largest = _largest_of_all()
 
     def cast(self, number: int | None) -> int | None:
-        """Vote, and return the result of the previous vote.
+        """Vote for a signal of this process, or None, and return the result of the previous vote.
 
-        Args:
-            number: the signal received by this process, or None.
-
-        Returns:
-            The largest number that any process voted, or None. With one process, its own number,
-            immediately.
+        It is the largest number that any process voted, or None; with one process, its own number,
+        immediately.
         """
         if jax.process_count() == 1:
             return number
@@ -279,7 +266,7 @@ def _finish() -> None:
 
 
 def _require_free(coordinator: str) -> None:
-    """Raise UserError if another program listens at the coordinator's address."""
+    """Refuse the coordinator's address if another program listens there."""
     port = int(coordinator.rpartition(":")[2])
     try:
         with socket.socket() as trial:

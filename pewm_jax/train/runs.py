@@ -1,4 +1,4 @@
-"""The folder of a run: its configuration, its finished weights, and its lock.
+"""A run: its stages, and its folder with configuration, finished weights and lock.
 
 ::
 
@@ -23,10 +23,12 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax import config as configuration
+from pewm_jax import worlds
 from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.io import atomic, weights
-from pewm_jax.train import processes, stages
+from pewm_jax.train import processes
 from pewm_jax.types import Params
+from pewm_jax.worlds.stages import Stage
 
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
@@ -71,6 +73,39 @@ KEPT = ("noise_key", "beta1", "beta2", "epsilon")
 values."""
 
 
+def all_stages(config: Config) -> tuple[Stage, ...]:
+    """Return the stages that the experiment's world defines, in order.
+
+    Optional ones without steps are left out.
+    """
+    return tuple(
+        stage
+        for stage in worlds.stages(config.model)
+        if not stage.optional or stage.settings(config).steps > 0
+    )
+
+
+def planned(config: Config) -> tuple[Stage, ...]:
+    """Return the stages with steps to train, in order.
+
+    Raises:
+        ConfigError: no stage has steps.
+        UserError: the model has no parameters that one of them could train.
+    """
+    known = all_stages(config)
+    stages = tuple(stage for stage in known if stage.settings(config).steps > 0)
+    if not stages:
+        names = " and ".join(f"train.{stage.name}.steps" for stage in known)
+        raise ConfigError(
+            f"{names} are {'both' if len(known) == 2 else 'all'} 0, so nothing would be trained: "
+            "set one of them."
+        )
+    for stage in stages:
+        if stage.require is not None:
+            stage.require(config.model)
+    return stages
+
+
 def identity(config: Config) -> dict[str, Any]:
     """Return the settings that identify a run, flattened: ``{"train.seed": 0, …}``."""
     flat = _flatten(json.loads(json.dumps(configuration.to_dict(config))))
@@ -102,7 +137,7 @@ def check(config: Config) -> Path:
 
     Raises:
         ConfigError: the folder contains a run of another configuration.
-        UserError: the path is not a folder.
+        UserError: the path cannot be a folder.
     """
     run = Path(config.train.run)
     try:
@@ -159,11 +194,11 @@ def prepare(config: Config) -> Path:
 
 def is_finished(run: Path, config: Config) -> bool:
     """Return whether the weights of the last planned stage are published and undamaged."""
-    last = stages.planned(config)[-1]
+    last = planned(config)[-1]
     return is_published(run, last, last.settings(config).steps)
 
 
-def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
+def is_published(run: Path, stage: Stage, step: int) -> bool:
     """Return whether the run's weights file is of this stage and step, and undamaged."""
     path = run / WEIGHTS
     try:
@@ -178,7 +213,7 @@ def is_published(run: Path, stage: stages.Stage, step: int) -> bool:
     return True
 
 
-def publish(run: Path, stage: stages.Stage, step: int, params: Params) -> Path:
+def publish(run: Path, stage: Stage, step: int, params: Params) -> Path:
     """Write the weights file for ``pewm_jax.load`` and return its path; called by all processes."""
     path = run / WEIGHTS
     params = processes.gather(params)
@@ -189,7 +224,7 @@ def publish(run: Path, stage: stages.Stage, step: int, params: Params) -> Path:
     return path
 
 
-def _metadata(stage: stages.Stage, step: int) -> dict[str, str]:
+def _metadata(stage: Stage, step: int) -> dict[str, str]:
     return {"stage": str(stage.number), "step": str(step)}
 
 

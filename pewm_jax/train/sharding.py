@@ -21,8 +21,8 @@ from pewm_jax import worlds
 from pewm_jax.config import AXES, Config, ConfigError, MeshConfig, World
 from pewm_jax.io import tree
 from pewm_jax.nn.placement import BATCH
-from pewm_jax.train.stages import Stage
 from pewm_jax.types import Params
+from pewm_jax.worlds.stages import Stage
 
 ALL_DATA = MeshConfig()
 """All devices along ``data``."""
@@ -60,16 +60,15 @@ def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_D
 def of_state(model: World, mesh: Mesh | AbstractMesh, state: Any) -> Any:
     """Return the shardings of a (possibly abstract) state, as a tree of the same structure.
 
-    A mesh axis that does not divide its dimension of a leaf is dropped for that leaf; ``left_out``
-    lists these.
+    A mesh axis that does not divide its dimension of a leaf is dropped for that leaf.
 
     Raises:
         TreeError: no rule matches some leaves.
     """
     return jax.tree.map(
-        lambda leaf, spec: NamedSharding(mesh, _fit_spec(mesh, leaf, spec)[0]),
+        lambda leaf, spec: NamedSharding(mesh, _fit_spec(mesh, leaf, spec)),
         state,
-        _specs(model, state),
+        tree.assign(rules(model), state, "sharding rules"),
     )
 
 
@@ -80,43 +79,21 @@ def constrain(model: World, params: Params) -> Params:
         return params
     specs = tree.assign(rules(model), {"params": params}, "sharding rules")["params"]
     return jax.tree.map(
-        lambda x, spec: jax.lax.with_sharding_constraint(x, _fit_spec(mesh, x, spec)[0]),
+        lambda x, spec: jax.lax.with_sharding_constraint(x, _fit_spec(mesh, x, spec)),
         params,
         specs,
     )
 
 
-def left_out(model: World, mesh: Mesh | AbstractMesh, state: Any) -> dict[str, tuple[str, ...]]:
-    """Return the leaves that are not sharded as their rule says, and the mesh axes dropped.
-
-    Args:
-        model: defines the sharding rules.
-        mesh: the devices.
-        state: a (possibly abstract) state.
-    """
-    leaves, specs = tree.flatten(state), tree.flatten(_specs(model, state))
-    missed = {path: _fit_spec(mesh, leaf, specs[path])[1] for path, leaf in leaves.items()}
-    return {path: axes for path, axes in missed.items() if axes}
-
-
-def _specs(model: World, state: Any) -> Any:
-    return tree.assign(rules(model), state, "sharding rules")
-
-
-def _fit_spec(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> tuple[P, tuple[str, ...]]:
-    """Align a spec to a leaf's last axes; also return the mesh axes that do not divide them."""
+def _fit_spec(mesh: Mesh | AbstractMesh, leaf: Any, spec: P) -> P:
+    """Align a spec to a leaf's last axes, without the mesh axes that do not divide them."""
     shape = tuple(getattr(leaf, "shape", ()))
     kept: list[str | None] = [None] * len(shape)
-    missed: list[str] = []
-    for place in range(1, len(spec) + 1):  # from the last axis forward
+    for place in range(1, min(len(spec), len(shape)) + 1):  # from the last axis forward
         axis = spec[-place]
-        if axis is None:
-            continue
-        if place <= len(shape) and shape[-place] % mesh.shape[axis] == 0:
+        if axis is not None and shape[-place] % mesh.shape[axis] == 0:
             kept[-place] = axis
-        else:
-            missed.append(axis)
-    return P(*kept), tuple(missed)
+    return P(*kept)
 
 
 def of_batch(mesh: Mesh) -> NamedSharding:
@@ -142,12 +119,9 @@ def place(values: Any, like: Any) -> Any:
     """Place weights on the devices: leaf by leaf, and only this process's shards of each leaf.
 
     Args:
-        values: nested dictionaries of arrays: NumPy arrays, including memory-mapped ones
-            (``weights.lazy``), or JAX arrays, which are moved between devices.
-        like: abstract arrays with shardings, for at least these paths.
-
-    Returns:
-        The same tree as JAX arrays, in the dtypes of ``like``.
+        values: nested dictionaries of NumPy arrays, including memory-mapped ones, or of JAX arrays,
+            which are moved between devices.
+        like: abstract arrays with dtypes and shardings, for at least these paths.
     """
     given, wanted = tree.flatten(values), tree.flatten(like)
     moved = {path: leaf for path, leaf in given.items() if isinstance(leaf, jax.Array)}
@@ -176,8 +150,7 @@ def require_divisible(config: Config, stage: Stage, mesh: Mesh | AbstractMesh) -
     """Raise an error if the batch, heads or channels cannot be sharded evenly.
 
     Raises:
-        ConfigError: the batch is not a multiple of the devices that share it, or the heads and
-            hidden channels are not multiples of those that share them.
+        ConfigError: they are not multiples of the devices that share them.
     """
     batch, devices = stage.settings(config).batch, math.prod(mesh.shape[axis] for axis in BATCH)
     if batch % devices:

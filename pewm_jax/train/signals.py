@@ -89,12 +89,7 @@ class Stop:
             self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: types.TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         if not self._before:
             return
         for number, handler in self._before.items():

@@ -24,8 +24,8 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.io import tree
 from pewm_jax.nn import target
 from pewm_jax.train import optimizer, sharding
-from pewm_jax.train.stages import Stage
 from pewm_jax.types import Array, Clip, Params
+from pewm_jax.worlds.stages import Stage
 
 Metrics = dict[str, Array]
 
@@ -52,11 +52,7 @@ class TrainState:
 def create(config: Config, stage: Stage, key: Array, start: Params | None = None) -> TrainState:
     """Return the initial state. Pure and jittable (``config``, ``stage`` static).
 
-    Args:
-        config: the experiment.
-        stage: the stage to begin.
-        key: PRNG key of the initial weights.
-        start: weights to start from instead of random ones; see ``require_start``.
+    ``start`` are weights to begin with instead of random ones; see ``require_start``.
 
     Raises:
         TreeError: ``start`` has other paths or shapes.
@@ -85,13 +81,8 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Non
     """Raise an error unless a stage can start from these weights.
 
     Leaves that match ``train.fresh`` may be missing and are initialized randomly: the memory blocks
-    of stage 2, which the weights of stage 1 do not contain.
-
-    Args:
-        config: the experiment.
-        stage: the stage to begin.
-        start: the weights, or any tree with their paths and shapes.
-        like: all parameters of the stage, or their shapes.
+    of stage 2, which the weights of stage 1 do not contain. ``start`` and ``like``, all parameters
+    of the stage, may be their shapes.
 
     Raises:
         TreeError: another leaf is missing, a leaf is unexpected or has another shape; lists them.
@@ -132,20 +123,16 @@ def train_step(
     key: Array,
     extra: Params | None = None,
 ) -> tuple[TrainState, Metrics]:
-    """Do one optimizer step.
+    """Do one optimizer step on a batch with leading B, uint8 colours and metric depth.
 
-    Args:
-        config: the experiment (static).
-        stage: the stage (static).
-        state: the state before the step.
-        clip: a batch with leading B, uint8 colours and metric depth.
-        key: from ``noise_key``, the same for all steps; the step number is folded in.
-        extra: weights needed only by the loss, see ``Stage.extra_weights``.
+    ``key`` is from ``noise_key``, the same for all steps; the step number is folded in. ``config``
+    and ``stage`` are static. ``extra`` are weights needed only by the loss
+    (``Stage.extra_weights``).
 
     Returns:
         The new state, and scalars: ``loss``, ``grad_norm`` (before clipping), ``learning_rate``,
-        and the metrics of the objective. If ``train.on_nonfinite`` is ``skip``, also ``skipped``:
-        1 if loss or gradient is not finite; then only ``step`` of the state changes.
+        and the metrics of the objective. If ``train.on_nonfinite`` is ``skip``, also ``skipped``: 1
+        if loss or gradient is not finite; then only ``step`` of the state changes.
     """
     trained, frozen = tree.split(state.params, stage.trained)
     step_key = jax.random.fold_in(key, state.step)
@@ -184,12 +171,12 @@ def train_step(
 
 
 def weights_key(config: Config, stage: Stage) -> Array:
-    """Return the PRNG key that a stage's initial weights are drawn from."""
+    """Return the PRNG key of a stage's initial weights."""
     return _keys(config, stage)[0]
 
 
 def noise_key(config: Config, stage: Stage) -> Array:
-    """Return the PRNG key that the noise of a stage's steps is drawn from."""
+    """Return the PRNG key of the noise in a stage's steps."""
     return _keys(config, stage)[1]
 
 
@@ -246,12 +233,8 @@ def trace_step(
 ) -> jax.stages.Traced:
     """Trace ``train_step`` for one batch shape, for lowering or reading its jaxpr.
 
-    Args:
-        config: the experiment.
-        stage: the stage.
-        mesh: the devices; those of a described topology need not exist.
-        clip: a batch, or the shapes of one.
-        extra: from ``load_extra_weights``, or its shapes.
+    The devices of ``mesh`` need not exist: they may be those of a described topology. ``clip`` is a
+    batch and ``extra`` is from ``load_extra_weights``; their shapes suffice.
     """
     state = abstract_state(config, stage, mesh)
     everywhere = sharding.replicated(mesh)
@@ -275,14 +258,9 @@ def trace_step(
 def compile_step(
     config: Config, stage: Stage, mesh: Mesh, clip: Any, extra: Params | None = None
 ) -> Callable[[TrainState, Clip, Array], tuple[TrainState, Metrics]]:
-    """Compile ``train_step`` ahead of time for one batch shape.
+    """Compile ``train_step`` ahead of time for the shapes of one batch.
 
-    Args:
-        config: the experiment.
-        stage: the stage.
-        mesh: the devices.
-        clip: a batch, or the shapes of one.
-        extra: from ``load_extra_weights``; loaded here if None.
+    ``extra`` is from ``load_extra_weights``; loaded here if None.
 
     Returns:
         The compiled ``(state, clip, key) -> (state, metrics)``; it consumes the state (its buffers
@@ -296,11 +274,7 @@ def compile_step(
 
 
 def _require_loss(found: Any, what: str) -> tuple[Array, Metrics]:
-    """Return what a loss returned, or refuse anything but one number and numbers by name.
-
-    Raises:
-        UserError: it is something else.
-    """
+    """Return what a loss returned, or refuse anything but one number and numbers by name."""
     if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], dict):
         raise UserError(
             f"{what} must return (loss, measured), a number and a dictionary of numbers; it "

@@ -21,59 +21,42 @@ from pewm_jax.data.loader import BadRecords
 from pewm_jax.io import atomic
 from pewm_jax.train import chips, feed, processes
 from pewm_jax.train.log import LiveView, MetricsLog, Pace, drop_after
-from pewm_jax.train.stages import Stage
 from pewm_jax.train.step import Metrics
 from pewm_jax.types import Params
+from pewm_jax.worlds.stages import Stage
 
 SKIPPED = "nonfinite.jsonl"
 """File in the run's folder with a line for every skipped update."""
 
 
+@dataclasses.dataclass
 class Watch:
-    """Reads, checks, displays and logs the metrics of one stage.
-
-    Args:
-        config: the experiment.
-        stage: the stage.
-        run: the run's folder.
-        done: number of steps of the stage already done.
-        devices: number of devices.
-        view: displays the metrics.
-        log: writes them to files.
-        bad: counts the records that cannot be decoded.
+    """Reads, checks, displays and logs the metrics of one stage, of which ``done`` steps are done.
 
     Attributes:
         flops: FLOPs that a step needs (``train.flops``), set when the first batch is known.
     """
 
-    flops = 0.0
+    config: Config
+    stage: Stage
+    run: Path
+    done: int
+    devices: int
+    view: LiveView
+    log: MetricsLog
+    bad: BadRecords
+    flops: float = 0.0
 
-    def __init__(
-        self,
-        config: Config,
-        stage: Stage,
-        run: Path,
-        done: int,
-        *,
-        devices: int,
-        view: LiveView,
-        log: MetricsLog,
-        bad: BadRecords,
-    ):
-        self.config, self.stage, self.run = config, stage, run
-        self.settings = stage.settings(config)
-        self.view, self.log, self.bad = view, log, bad
+    def __post_init__(self):
+        self.settings = self.stage.settings(self.config)
         self.pace = Pace(time.monotonic())
-        self._devices, self._chip = devices, chips.find(jax.devices()[0].device_kind)
-        self._skipped = self._skipped_before(done)
+        self._chip = chips.find(jax.devices()[0].device_kind)
+        self._skipped = self._skipped_before(self.done)
 
     def read(self, step: int, metrics: Metrics, kept: Callable[[], str]) -> dict[str, float]:
         """Wait for a step's metrics, check and display them.
 
-        Args:
-            step: its number.
-            metrics: returned by the step.
-            kept: returns a phrase that names the newest checkpoint on disk.
+        ``kept`` returns a phrase that names the newest checkpoint on disk.
 
         Raises:
             UserError: loss or gradient is not finite, and such steps are not to be skipped.
@@ -83,7 +66,7 @@ class Watch:
         if not (math.isfinite(values["loss"]) and math.isfinite(values["grad_norm"])):
             self._not_finite(step, values, skipped, kept)
         seconds = self.pace.tick(time.monotonic())
-        rate = self.flops / seconds / self._devices
+        rate = self.flops / seconds / self.devices
         values |= {
             "step_seconds": seconds,
             "clips_per_second": self.settings.batch / seconds,
@@ -195,64 +178,48 @@ Preview = Callable[[Params, Stage, int], Previewed]
 """Called with inference weights, stage and step; writes samples and measures them."""
 
 
+@dataclasses.dataclass
 class Samples:
     """Makes, displays and measures the samples of a stage.
 
-    Args:
-        config: the experiment.
-        stage: the stage.
-        preview: makes them, or None.
-        log: prints progress.
-        unless_stopped: calls work that a stop signal may interrupt (``Stop.unless_requested``).
+    ``unless_stopped`` calls work that a stop signal may interrupt (``Stop.unless_requested``).
     """
 
-    def __init__(
-        self,
-        config: Config,
-        stage: Stage,
-        preview: Preview | None,
-        *,
-        log: Callable[[str], Any],
-        unless_stopped: Callable[[Callable[[], Previewed]], Previewed | None],
-    ):
-        self._every = config.train.preview_every
-        self._steps = stage.settings(config).steps
-        self._stage, self._preview = stage, preview
-        self._log, self._unless_stopped = log, unless_stopped
-        self._made = False
+    config: Config
+    stage: Stage
+    preview: Preview | None
+    log: Callable[[str], Any]
+    unless_stopped: Callable[[Callable[[], Previewed]], Previewed | None]
+    _made: bool = False
 
     def due(self, step: int) -> bool:
         """Return whether a step has samples: every ``train.preview_every``-th and the last."""
-        wanted = self._preview is not None and self._every > 0
-        return wanted and (step % self._every == 0 or step == self._steps)
+        every, steps = self.config.train.preview_every, self.stage.settings(self.config).steps
+        return self.preview is not None and every > 0 and (step % every == 0 or step == steps)
 
     def make(self, params: Params, step: int) -> dict[str, float]:
         """Make samples, unless a signal interrupts it or they do not fit into memory.
 
-        Called by all processes; process 0, to which the weights are gathered, makes them.
-
-        Args:
-            params: inference weights.
-            step: the number of the step.
+        Called by all processes; process 0, to which the inference weights are gathered, makes them.
 
         Returns:
             PSNR in dB, by metric name for the log.
         """
-        params, preview = processes.gather(params), self._preview
+        params, preview = processes.gather(params), self.preview
         if preview is None or not processes.is_primary():
             return {}
         if not self._made:
-            self._log(f"{self._stage.title}: compiling the sampler for sample pictures …")
+            self.log(f"{self.stage.title}: compiling the sampler for sample pictures …")
         self._made = True
         try:
-            made = self._unless_stopped(lambda: preview(params, self._stage, step))
+            made = self.unless_stopped(lambda: preview(params, self.stage, step))
         except (jax.errors.JaxRuntimeError, UserError) as error:
             reason = " ".join(str(error).split())[:160]
-            self._log(f"{self._stage.title}: no sample pictures of step {step} ({reason})")
+            self.log(f"{self.stage.title}: no sample pictures of step {step} ({reason})")
             return {}
         if made is None:
             return {}
         scores = ", ".join(f"{IMAGINED[name]} {value:.1f} dB" for name, value in made.psnr.items())
         files = f"sample pictures {' and '.join(map(str, made.files))}"
-        self._log(f"{self._stage.title}: {f'{scores}; {files}' if scores else files}")
+        self.log(f"{self.stage.title}: {f'{scores}; {files}' if scores else files}")
         return {f"psnr_{name}": value for name, value in made.psnr.items()}

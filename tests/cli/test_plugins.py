@@ -14,7 +14,7 @@ def test_a_file_called_as_a_module_does_not_replace_it(tmp_path, name):
     file.write_text("")
     before = sys.modules.get(name)
     with pytest.raises(ConfigError, match=rf"called as the module '{name}'.*my_{name}\.py"):
-        plugins.take(["--plugin", str(file)])
+        plugins.run(["--plugin", str(file)])
     assert sys.modules.get(name) is before
 
 
@@ -34,5 +34,5 @@ def test_a_file_that_fails_is_named_with_its_line(tmp_path, text, message):
     file = tmp_path / "broken_file.py"
     file.write_text(text)
     with pytest.raises(ConfigError, match=message):
-        plugins.take(["--plugin", str(file)])
+        plugins.run(["--plugin", str(file)])
     assert "broken_file" not in sys.modules

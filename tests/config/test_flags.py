@@ -9,7 +9,6 @@ import pytest
 from pewm_jax import config as configuration
 from pewm_jax import presets
 from pewm_jax import registry as kinds
-from pewm_jax.cli import flags
 from pewm_jax.cli import parser as cli
 from pewm_jax.config import Config, ConfigError
 from pewm_jax.diffusion.edm import EDMConfig
@@ -37,18 +36,16 @@ def leaves(table, prefix=""):
 def test_the_model_s_settings_have_short_names():
     world = ("--model.kind", "--version")
     full = [
-        name
-        for name, _ in flags.flags_of(TINY)
-        if name.startswith("--model.") and name not in world
+        name for name, _ in cli.flags_of(TINY) if name.startswith("--model.") and name not in world
     ]
     short = [name.replace("--model.", "--") for name in full]
     assert len(full) > 50
-    assert flags.full_names(short, TINY) == full
-    assert flags.full_names(full, TINY) == full
+    assert cli.full_names(short, TINY) == full
+    assert cli.full_names(full, TINY) == full
     other = [
-        name for name, _ in flags.flags_of(TINY) if not name.startswith("--model.") or name in world
+        name for name, _ in cli.flags_of(TINY) if not name.startswith("--model.") or name in world
     ]
-    assert flags.full_names(other, TINY) == other
+    assert cli.full_names(other, TINY) == other
 
 
 def test_a_short_name_a_full_one_and_one_with_hyphens_set_the_same():
@@ -93,8 +90,8 @@ def test_a_kind_is_chosen_by_its_earlier_name_too_and_keeps_what_the_kinds_share
 def test_every_flag_of_an_earlier_version_is_one_now():
     preset = presets.load("pewm_2b")
     old = [f"--{name}" for name in leaves(json.loads((VERSION_1 / "pewm_2b.json").read_text()))]
-    now = set(flags.full_names(old, preset))
-    known = {name for name, _ in flags.flags_of(preset)}
+    now = set(cli.full_names(old, preset))
+    known = {name for name, _ in cli.flags_of(preset)}
     of_other_kinds = {
         "--model.codec.spatial",
         "--model.memory.snapshots",
@@ -245,7 +242,7 @@ def test_a_flag_is_negated_in_every_spelling(setting, new):
     spellings = [f"no-{setting}", f"no_{setting}", f"{head}.no-{last}", f"{head}.no_{last}"]
     spellings += [name.replace("_", "-") for name in spellings]
     for name in spellings:
-        (full,) = flags.full_names([f"--{name}"], VAE)
+        (full,) = cli.full_names([f"--{name}"], VAE)
         assert full.replace("no-", "no_").replace("-terminal-snr", "_terminal_snr") == f"--{new}"
         assert parse(f"--{name}", default=VAE) == parse(f"--{new}", default=VAE)
 

@@ -161,7 +161,7 @@ def arguments(command):
 
 def read(words):
     """Read the arguments of a command, and do not run it."""
-    name, rest = program.find(plugins.take(words))
+    name, rest = program.find(plugins.run(words))
     assert name in program.COMMANDS, words
     if name in ("train", "plan") and rest and not rest[0].startswith("-"):
         rest[0] = rest[0] if (ROOT / "configs" / f"{rest[0]}.py").is_file() else "demo"

@@ -15,7 +15,7 @@ import pytest
 import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
-from pewm_jax.cli import flags
+from pewm_jax.cli import parser
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import loader
 from pewm_jax.io import tree
@@ -191,7 +191,7 @@ def test_their_settings_travel_through_json_and_flags():
     values = json.loads(json.dumps(configuration.to_dict(config)))
     assert values["model"]["backbone"] == {"kind": "perceptron", "depth": 2, "width": 32}
     assert configuration.from_dict(Config, values) == config
-    chosen, rest = flags.take_kinds(["--model.noise.kind", "cosine", "--x"], Config())
+    chosen, rest = parser.take_kinds(["--model.noise.kind", "cosine", "--x"], Config())
     assert (type(chosen.model.noise), rest) == (type(config.model.noise), ["--x"])
 
 

@@ -102,7 +102,7 @@ def trained(request, data, tmp_path_factory):
 def load(trained, run_folder="run"):
     kind, folder, _ = trained
     if kind not in registry.names("world"):
-        plugins.take(["--plugin", str(folder / "mine.py")])
+        plugins.run(["--plugin", str(folder / "mine.py")])
     return pewm_jax.load(folder / run_folder)
 
 
@@ -192,8 +192,8 @@ def test_the_memory_of_the_example_matters(trained):
 def test_the_example_is_short_and_a_wrong_file_is_refused(tmp_path):
     assert len(FILES["keyframes"].read_text().splitlines()) <= 90
     with pytest.raises(ConfigError, match=r"--plugin needs the path of a Python file .* 'absent"):
-        plugins.take(["--plugin", "absent.py"])
+        plugins.run(["--plugin", "absent.py"])
     wrong = tmp_path / "mine_wrong_world.py"
     wrong.write_text("raise ValueError('two\\nlines')")
     with pytest.raises(ConfigError, match="ValueError: two lines"):
-        plugins.take(["--plugin", str(wrong)])
+        plugins.run(["--plugin", str(wrong)])

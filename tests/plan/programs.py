@@ -16,10 +16,12 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae_codec import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
-from pewm_jax.plan import hlo, measure, suggest
+from pewm_jax.plan import measure, suggest
 from pewm_jax.plan.measure import MeshSizes
+from pewm_jax.plan.program import COLLECTIVES
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.render import BothConfig
+from pewm_jax.train import chips
 from pewm_jax.worlds.pewm.world import PEWM, STAGES
 
 DINOV2 = DINOv2Config(layers=2, heads=2, width=64, pretrained_size=56)
@@ -95,13 +97,14 @@ def compare(number, settings, devices):
     traced = measure.trace(config, stage, used)
     compiled = measure.compile_traced(traced, mesh)
     work = measure.work_of(config, stage, traced, None)
-    sent = suggest.traffic(config, stage, mesh, work, compiled)
+    sent = suggest.Job(config, stage, chips.named("h200"), work, compiled).traffic(mesh)
     return {
         "flops": compiled.program.flops,
         "flops_expected": sum(work.on_device(mesh).values()),
-        "sent": {kind: compiled.program.sent(kind) for kind in hlo.KINDS},
+        "sent": {kind: compiled.program.sent(kind) for kind in COLLECTIVES},
         "sent_expected": {
-            kind: sum(size for (one, _), size in sent.items() if one == kind) for kind in hlo.KINDS
+            kind: sum(size for (one, _), size in sent.items() if one == kind)
+            for kind in COLLECTIVES
         },
         "unknown": compiled.program.unknown,
         "state": compiled.arguments,

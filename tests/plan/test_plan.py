@@ -14,10 +14,11 @@ import pytest
 from pewm_jax import presets as configs
 from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
 from pewm_jax.data import abstract
-from pewm_jax.plan import hlo, measure, plan, suggest
+from pewm_jax.plan import measure, plan, suggest
 from pewm_jax.plan.measure import Compiled, MeshSizes
+from pewm_jax.plan.program import Collective, Program
 from pewm_jax.plan.suggest import counts
-from pewm_jax.train import chips, flops, stages
+from pewm_jax.train import chips, flops, runs
 from pewm_jax.worlds.pewm.world import STAGES
 from tests.train import fakes
 
@@ -78,7 +79,7 @@ def test_a_plan_need_not_be_compiled_and_is_not_where_that_takes_very_long(monke
 
 def test_the_u_net_of_svd_has_too_many_arrays_to_compile():
     config = configs.load("egowm_svd")
-    (stage,) = stages.planned(config)
+    (stage,) = runs.planned(config)
     assert not plan._should_compile(config, stage, launch())
     assert plan._should_compile(config, stage, dataclasses.replace(launch(), compiled="on"))
 
@@ -131,7 +132,7 @@ def work(name, number):
 
 
 def compiled(mesh, temporary):
-    return Compiled(hlo.Program((), (), ()), 0.0, temporary, mesh, 0.0)
+    return Compiled(Program(), 0.0, temporary, mesh, 0.0)
 
 
 @pytest.mark.slow
@@ -144,9 +145,8 @@ def test_the_presets_fit_on_h200_in_both_stages(name, temporary, devices):
     config = configs.load(name)
     eight, mesh = (MeshSizes(*config.train.mesh.shape(n)) for n in (8, devices))
     for stage, held in zip(STAGES[:2], temporary, strict=True):
-        choice = suggest.assess(
-            config, stage, mesh, H200, work(name, stage.number), compiled(eight, held)
-        )
+        found = work(name, stage.number)
+        choice = suggest.Job(config, stage, H200, found, compiled(eight, held)).assess(mesh)
         assert choice.fits, (stage.number, choice.memory)
         assert 0.2 < choice.time.mfu < 0.65
 
@@ -154,7 +154,8 @@ def test_the_presets_fit_on_h200_in_both_stages(name, temporary, devices):
 def test_every_suggestion_uses_all_devices_and_shares_batch_and_heads():
     config = configs.load("pewm_2b")
     stage, mesh = STAGES[1], MeshSizes(fsdp=64)
-    ranked = suggest.rank(config, stage, mesh, H200, work("pewm_2b", 2), compiled(mesh, 12e9))
+    job = suggest.Job(config, stage, H200, work("pewm_2b", 2), compiled(mesh, 12e9))
+    ranked = job.rank(mesh.devices)
     assert len(ranked) == len({choice.mesh for choice in ranked}) > 10
     for choice in ranked:
         mesh = choice.mesh
@@ -197,8 +198,8 @@ def test_temporary_memory_follows_the_share_of_the_clips_in_the_chip_s_precision
 def test_what_is_sent_along_an_axis_is_found_by_its_groups():
     mesh = MeshSizes(data=2, context=2)
     sent = [("all-gather", (0, 1), 5.0), ("all-gather", (0, 2), 7.0), ("all-reduce", (2, 3), 1.0)]
-    items = tuple(hlo.Collective(kind, "", group, size) for kind, group, size in sent)
-    program = Compiled(hlo.Program((), items, ()), 0.0, 0.0, mesh, 0.0)
+    items = [Collective(*item) for item in sent]
+    program = Compiled(Program(collectives=items), 0.0, 0.0, mesh, 0.0)
     assert program.sent_along("context") == {"all-gather": 5.0, "all-reduce": 1.0}
     assert program.sent_along("data") == {"all-gather": 7.0}
 

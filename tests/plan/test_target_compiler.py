@@ -15,7 +15,9 @@ from pewm_jax import presets
 from pewm_jax.config import ConfigError, Launch, UserError
 from pewm_jax.nn import attention, target
 from pewm_jax.nn.target import Target
-from pewm_jax.plan import chip_program, hlo, plan, target_compiler, target_plan, topology
+from pewm_jax.plan import plan, program, target_compiler, topology
+from pewm_jax.plan.measure import MeshSizes
+from pewm_jax.plan.program import Collective
 from pewm_jax.plan.target_compiler import StageReport
 from pewm_jax.train import chips, flops
 
@@ -76,7 +78,7 @@ def test_an_unknown_compiler_is_refused():
 def test_a_plan_without_the_chip_s_compiler_writes_its_estimates_in_the_same_form():
     launch = Launch(plan=True, devices=1, chip="v5e", compiled="off")
     plans = plan.show(presets.load("tiny"), launch, lambda _: None)
-    estimates = [target_plan.estimate(one) for one in plans]
+    estimates = [plan.estimate(one) for one in plans]
     assert [one.name for one in estimates] == ["stage1", "stage2"]
     for one in estimates:
         assert one.temporary_bytes is None, "not compiled"
@@ -161,7 +163,7 @@ def test_the_plan_prints_every_stage_and_writes_the_numbers(monkeypatch, tmp_pat
     monkeypatch.setattr(target_compiler, "compile_stage", compile_stage)
     file, said = tmp_path / "plan.json", []
     launch = Launch(plan=True, devices=2, chip="v5p", compiler="target", json=str(file))
-    target_plan.show(presets.load("tiny"), launch, said.append)
+    plan.show(presets.load("tiny"), launch, said.append)
     assert asked == [("stage1", "v5p", 2), ("stage2", "v5p", 2)]
     text = "\n".join(said)
     for words in ("34.00 GiB", "fits: 34.00 GiB of 95.00 GiB", "splash_mha_fwd × 30", "MFU 75.0%"):
@@ -173,11 +175,32 @@ def test_the_plan_prints_every_stage_and_writes_the_numbers(monkeypatch, tmp_pat
     ]
 
 
+@pytest.mark.parametrize("compiler", ["cpu", "target"])
+@pytest.mark.parametrize("file", ["none/plan.json", "", "file/plan.json"])
+def test_a_file_that_cannot_be_written_is_refused_before_compiling(
+    monkeypatch, capsys, tmp_path, compiler, file
+):
+    from pewm_jax.cli import main
+
+    def compiled(*_, **__):
+        raise AssertionError("it is compiled")
+
+    monkeypatch.setattr(topology, "require_compiler", lambda chip: None)
+    monkeypatch.setattr(target_compiler, "compile_stage", compiled)
+    monkeypatch.setattr(plan, "plan_stage", compiled)
+    (tmp_path / "file").touch()
+    flags = ("--devices", "1", "--compiler", compiler, "--json", str(tmp_path / file))
+    assert main.main(["plan", "tiny", *flags]) == 2
+    error = capsys.readouterr().err
+    assert f"--json {tmp_path / file}" in error
+    assert len(error.strip().splitlines()) == 1
+
+
 def test_what_does_not_fit_is_printed_with_the_compiler_s_reason():
     refused = report(
         fits=False, peak_bytes=None, temporary_bytes=None, roofline_s=None, mfu=None, refusal="No."
     )
-    text = "\n".join(target_plan.lines(refused, "stage 1", 256))
+    text = "\n".join(plan.report_lines(refused, "stage 1", 256))
     assert "does not fit: more of 95.00 GiB" in text
     assert "the compiler refused it: No." in text
 
@@ -186,37 +209,36 @@ PROGRAM = (Path(__file__).parent / "program.hlo").read_text()
 
 
 def test_a_chip_s_program_is_read_with_its_loops_slices_and_memories():
-    program = chip_program.read(PROGRAM)
-    assert program.kernels == {
+    found = program.read(PROGRAM, for_chip=True)
+    assert found.kernels == {
         "attention": {"splash_mha_fwd": 1},
         "gemm": {"XLA fusion": 5},
     }
-    assert program.unknown == ()
+    assert found.unknown == []
     row = 8 * 4 * 4
     in_loop = (8 * 16 * 4 + row) + (row + 4 + row) + (row + 4 + row)
     kernel = 4 * 2 * 128 * 128 * 2
     gather = 2 * 128 * 128 * 2  # its result is in on-chip memory
-    assert program.bytes == 5 * in_loop + kernel + gather
-    assert [item.kind for item in program.collectives] == ["all-gather"], "continuations are none"
+    assert found.bytes == 5 * in_loop + kernel + gather
+    assert [item.kind for item in found.collectives] == ["all-gather"], "continuations are none"
 
 
 def test_communication_is_named_by_the_axes_of_the_mesh():
-    sizes = {"data": 2, "fsdp": 2, "tensor": 1, "context": 2}
     items = [
-        hlo.Collective("all-gather", "", (0, 2), 1.0),
-        hlo.Collective("all-gather", "", (2, 0), 2.0),
-        hlo.Collective("all-reduce", "", (0, 2, 4, 6), 4.0),
-        hlo.Collective("all-reduce", "", tuple(range(8)), 8.0),
-        hlo.Collective("all-reduce", "", (0, 1, 2), 16.0),
-        hlo.Collective("collective-permute", "", (3, 2), 32.0),
+        Collective("all-gather", (0, 2), 1.0),
+        Collective("all-gather", (2, 0), 2.0),
+        Collective("all-reduce", (0, 2, 4, 6), 4.0),
+        Collective("all-reduce", tuple(range(8)), 8.0),
+        Collective("all-reduce", (0, 1, 2), 16.0),
+        Collective("collective-permute", (3, 2), 32.0),
     ]
-    assert target_compiler._along_axes(items, sizes) == [
-        {"kind": "all-gather", "axis": "fsdp", "bytes": 3.0},
-        {"kind": "all-reduce", "axis": "data+fsdp", "bytes": 4.0},
-        {"kind": "all-reduce", "axis": "data+fsdp+context", "bytes": 8.0},
-        {"kind": "all-reduce", "axis": "other", "bytes": 16.0},
-        {"kind": "collective-permute", "axis": "context", "bytes": 32.0},
-    ]
+    assert MeshSizes(data=2, fsdp=2, context=2).sent(items) == {
+        ("all-gather", "fsdp"): 3.0,
+        ("all-reduce", "data+fsdp"): 4.0,
+        ("all-reduce", "data+fsdp+context"): 8.0,
+        ("all-reduce", "other"): 16.0,
+        ("collective-permute", "context"): 32.0,
+    }
 
 
 INDEPENDENT = """
@@ -227,7 +249,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as P
 from pewm_jax import config, presets
 from pewm_jax.data import abstract
 from pewm_jax.nn import target
-from pewm_jax.train import stages, step
+from pewm_jax.train import step
 from pewm_jax.worlds.pewm.world import STAGES
 import dataclasses
 

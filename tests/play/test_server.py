@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 from pewm_jax.cli import main as program
 from pewm_jax.cli import play
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.play import page, panels, serving, session
+from pewm_jax.play import page, serving, session
 from pewm_jax.play.settings import Serve, Start
 from tests.play.tiny_drive import FORWARD, Toy, a_place, a_toy
 
@@ -101,7 +101,7 @@ def test_the_terminal_is_told_now_and_then_what_is_waited_for(tmp_path, monkeypa
         told.clear()
         for seconds in range(1, 4):
             one._tell(session.PageUpdate(f"Preparing … {seconds} s", busy=True))
-        monkeypatch.setattr(panels, "SAY_AGAIN_S", 0.0)
+        monkeypatch.setattr(page, "SAY_AGAIN_S", 0.0)
         one._tell(session.PageUpdate("Preparing … 4 s", busy=True))
         one._tell(session.PageUpdate("Drive."))
         assert told == ["Preparing … 1 s", "Preparing … 4 s", "Ready."]
@@ -241,8 +241,9 @@ def test_the_command_refuses_what_is_no_run_and_says_what_is_missing():
 
 def test_settings_of_a_page_are_those_of_its_parts():
     settings = play.Settings(model="small", house=5, port=0)
-    assert play._part(Start, settings).house == 5
-    assert play._part(Serve, settings).port == 0
+    assert isinstance(settings, Start)
+    assert isinstance(settings, Serve)
+    assert (settings.house, settings.port) == (5, 0)
     with pytest.raises(ConfigError):
         play.Settings(model="small", port=-1)
     assert session.Begin(Start()).start.house == 2

@@ -32,7 +32,8 @@ from pewm_jax.io import tree, weights
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.plan import plan
-from pewm_jax.train import loading, loop, stages, step
+from pewm_jax.train import loading, loop, runs, step
+from pewm_jax.worlds import stages
 from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 from tests.helpers import random_camera
 
@@ -286,7 +287,7 @@ def test_a_model_starts_from_it_and_is_refused_without_it(clips, tmp_path):
     train = dataclasses.replace(tiny.train, start=str(run), fresh=fresh)
     tiny = dataclasses.replace(tiny, train=train)
     loading.require_weights(tiny)
-    stage = stages.planned(tiny)[0]
+    stage = runs.planned(tiny)[0]
     start = loading.read_weights(tiny, stage, print)
     mesh = loop.sharding.make_mesh()
     state = step.initial_state(tiny, stage, mesh, start)

@@ -25,7 +25,7 @@ from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.wan.codec import WanVAECodec
-from pewm_jax.plan import hlo
+from pewm_jax.plan import program
 from pewm_jax.plan.measure import QUICK
 from pewm_jax.train import flops, sharding
 from pewm_jax.train import step as state
@@ -82,7 +82,7 @@ def test_the_transformer_learns_with_actions_and_the_codec_stands_still(stepped)
 def test_its_sums_are_those_of_the_compiled_step(stepped):
     config, stage, *_, text = stepped
     needed = flops.of_stage(config, stage, abstract.clip(config, 2)).total
-    assert needed == pytest.approx(hlo.read(text).flops, rel=0.02)
+    assert needed == pytest.approx(program.read(text).flops, rel=0.02)
 
 
 def test_every_leaf_has_its_place_on_many_devices():

@@ -27,7 +27,7 @@ from pewm_jax.models.clip.config import CLIPVisionConfig
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.vae_codec import SVDVAECodec
-from pewm_jax.plan import hlo
+from pewm_jax.plan import program
 from pewm_jax.plan.measure import QUICK
 from pewm_jax.train import flops, sharding, step
 from pewm_jax.train import step as state
@@ -117,7 +117,7 @@ def test_a_video_model_is_made_first_where_there_is_none_and_the_control_waits(s
 def test_its_sums_are_those_of_the_compiled_step(svd):
     config, stage, *_, text = svd
     needed = flops.of_stage(config, stage, abstract.clip(config, 2)).total
-    assert needed == pytest.approx(hlo.read(text).flops, rel=0.02)
+    assert needed == pytest.approx(program.read(text).flops, rel=0.02)
 
 
 def test_every_leaf_has_its_place_on_many_devices():

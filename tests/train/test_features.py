@@ -12,7 +12,7 @@ from pewm_jax.data import loader
 from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.memory import feature_cache
 from pewm_jax.memory import feature_cache as feature_build
-from pewm_jax.train import loading, loop, runs, stages
+from pewm_jax.train import loading, loop, runs
 from pewm_jax.worlds import objective
 from pewm_jax.worlds.pewm import world as pewm
 from tests.data import two_rooms as data_world
@@ -74,7 +74,7 @@ def test_training_on_stale_features_is_refused(config, tmp_path, monkeypatch):
         stage2=dataclasses.replace(train.stage2, steps=1, batch=2),
     )
     stale = dataclasses.replace(config.with_model(memory=other), train=train)
-    monkeypatch.setattr(stages, "planned", lambda _: [pewm.STAGES[1]])
+    monkeypatch.setattr(runs, "planned", lambda _: [pewm.STAGES[1]])
     monkeypatch.setattr(loop, "initial_state", fake_state)
     with pytest.raises(UserError, match=r"stale: it was made with other preprocessing"):
         loop.train(stale, log=lambda _: None)

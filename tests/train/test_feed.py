@@ -15,7 +15,7 @@ WHERE = sharding.of_batch(sharding.make_mesh(jax.devices()[:1]))
 
 
 def test_batches_come_in_order_and_on_the_devices():
-    with Feed(({"x": np.full((8,), n)} for n in itertools.count()), WHERE) as feed:
+    with Feed(({"x": np.full((8,), n)} for n in itertools.count()), WHERE, 8) as feed:
         for number in range(20):
             batch = next(feed)
             assert batch["x"].sharding == WHERE
@@ -27,14 +27,14 @@ def test_an_error_of_the_source_is_raised_where_the_batch_would_have_been():
         yield np.zeros(8)
         raise UserError("shard 3 is truncated")
 
-    with Feed(source(), WHERE) as feed:
+    with Feed(source(), WHERE, 8) as feed:
         next(feed)
         with pytest.raises(UserError, match="shard 3"):
             next(feed)
 
 
 def test_data_that_end_are_an_error():
-    with Feed(iter([np.zeros(8)]), WHERE) as feed:
+    with Feed(iter([np.zeros(8)]), WHERE, 8) as feed:
         next(feed)
         with pytest.raises(UserError, match="ended"):
             next(feed)
@@ -51,7 +51,7 @@ def test_only_a_few_batches_are_read_ahead_and_the_thread_ends_with_training():
         finally:
             closed.set()
 
-    with Feed(source(), WHERE) as feed:
+    with Feed(source(), WHERE, 8) as feed:
         next(feed)
     assert len(read) <= 1 + AHEAD + 1
     assert closed.is_set()

@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.train import flops
+from pewm_jax.train import flops, jaxprs
 
 N, D, M = 6, 8, 4
 X, W, V = jnp.ones((N, D)), jnp.ones((D, M)), jnp.ones((M, D))
@@ -150,7 +150,7 @@ def test_a_sharded_program_counts_all_devices():
     eqn = next(e for e in jax.make_jaxpr(f)(X, W).eqns if e.primitive.name == "shard_map")
     params = {**eqn.params, "mesh": four}
     again = type("Eqn", (), {"primitive": eqn.primitive, "params": params})
-    assert flops._copies(again) == 4
+    assert jaxprs.copies(again) == 4
 
 
 def test_recomputation_is_executed_and_not_needed():
@@ -261,8 +261,8 @@ def test_axes_follow_a_weight(order):
     w = jnp.ones((2, 3, 5))
     axes = ("a", "b", "c")
     eqn = jax.make_jaxpr(lambda w: jnp.transpose(w, order))(w).eqns
-    moved = flops._moved(eqn[0], axes) if eqn else axes
+    moved = jaxprs.moved(eqn[0], axes) if eqn else axes
     assert moved == tuple(axes[k] for k in order)
-    assert flops._reshaped((2, 3, 5), (6, 5), axes) == ("a", "c")
-    assert flops._reshaped((6, 5), (2, 3, 5), ("a", "c")) == ("a", None, "c")
+    assert jaxprs._reshaped((2, 3, 5), (6, 5), axes) == ("a", "c")
+    assert jaxprs._reshaped((6, 5), (2, 3, 5), ("a", "c")) == ("a", None, "c")
     assert np.prod(order) == 0

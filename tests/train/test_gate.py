@@ -19,7 +19,7 @@ from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.render import RenderConfig
-from pewm_jax.train import loop, stages
+from pewm_jax.train import loop, runs
 from pewm_jax.types import Frames
 from pewm_jax.worlds import codec as codec_gate
 from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
@@ -208,5 +208,5 @@ def test_without_a_gate_there_is_nothing_to_learn():
         LAST.prepare(config.model, {}, batch(config, 1))
     train = dataclasses.replace(config.train, gate=StageConfig(steps=1))
     with pytest.raises(UserError, match=r"this model has no gate"):  # before stage 1
-        stages.planned(dataclasses.replace(config, train=train))
-    assert stages.planned(dataclasses.replace(imagining(), train=train))[-1].name == "gate"
+        runs.planned(dataclasses.replace(config, train=train))
+    assert runs.planned(dataclasses.replace(imagining(), train=train))[-1].name == "gate"

@@ -7,7 +7,8 @@ import numpy as np
 
 from pewm_jax import presets as configs
 from pewm_jax.io import tree, weights
-from pewm_jax.train import loop, sharding, stages
+from pewm_jax.train import loop, runs, sharding
+from pewm_jax.worlds import stages
 from pewm_jax.worlds.pewm import world as pewm
 from tests.train import fakes
 
@@ -67,8 +68,8 @@ def test_joint_trains_backbone_and_memory_and_not_the_codec_with_its_gate():
 
 def test_optional_stages_are_left_out_without_steps():
     config = configs.load("demo")
-    assert [stage.name for stage in stages.planned(config)] == ["stage1", "stage2"]
+    assert [stage.name for stage in runs.planned(config)] == ["stage1", "stage2"]
     config = fakes.with_stage(config, "joint", steps=1)
-    assert [stage.name for stage in stages.planned(config)] == ["stage1", "stage2", "joint"]
+    assert [stage.name for stage in runs.planned(config)] == ["stage1", "stage2", "joint"]
     config = fakes.with_stage(config, "stage2", steps=0)
-    assert [stage.name for stage in stages.planned(config)] == ["stage1", "joint"]
+    assert [stage.name for stage in runs.planned(config)] == ["stage1", "joint"]

@@ -9,8 +9,9 @@ import pytest
 
 from pewm_jax import presets as configs
 from pewm_jax.io import tree
-from pewm_jax.train import optimizer, stages
+from pewm_jax.train import optimizer
 from pewm_jax.train.signals import Interrupted
+from pewm_jax.worlds import stages
 from pewm_jax.worlds.pewm.world import STAGES
 from tests.train import fakes
 from tests.train.test_loop import StopAt, file_bytes, losses, train

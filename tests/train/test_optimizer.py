@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import ConfigError, StageConfig
-from pewm_jax.train import optimizer, stages
+from pewm_jax.train import optimizer, runs
 from pewm_jax.worlds.pewm import world as pewm
 from tests.train import fakes
 
@@ -86,6 +86,6 @@ def test_a_stage_may_learn_faster_at_some_paths():
 
 def test_nothing_to_train_is_refused_and_empty_stages_are_skipped():
     with pytest.raises(ConfigError, match="both 0"):
-        stages.planned(fakes.config(stage1=0, stage2=0))
-    assert [s.number for s in stages.planned(fakes.config(stage2=0))] == [1]
-    assert [s.number for s in stages.planned(fakes.config())] == [1, 2]
+        runs.planned(fakes.config(stage1=0, stage2=0))
+    assert [s.number for s in runs.planned(fakes.config(stage2=0))] == [1]
+    assert [s.number for s in runs.planned(fakes.config())] == [1, 2]

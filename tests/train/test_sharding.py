@@ -97,13 +97,12 @@ def test_a_leaf_that_no_rule_knows_is_refused(part):
         sharding.of_state(LARGE, MESH, alien)
 
 
-def test_an_axis_that_does_not_divide_is_left_out_and_named():
+def test_an_axis_that_does_not_divide_is_left_out():
     name = "backbone/blocks/to_q/kernel"
     like = tree.unflatten({f"params/{name}": jax.ShapeDtypeStruct((3, 6, 8), jnp.float32)})
     assert tree.flatten(sharding.of_state(LARGE, MESH, like))[f"params/{name}"].spec == P(
         None, None, "tensor"
     )
-    assert sharding.left_out(LARGE, MESH, like) == {f"params/{name}": ("fsdp",)}
 
 
 def test_frozen_weights_are_kept_in_half_precision_and_trained_ones_in_full():

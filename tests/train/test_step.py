@@ -12,9 +12,9 @@ from pewm_jax import presets as configs
 from pewm_jax.config import AXES, ConfigError, UserError
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.train import optimizer, sharding, stages, step
+from pewm_jax.train import optimizer, sharding, step
 from pewm_jax.train import step as state
-from pewm_jax.worlds import world_model
+from pewm_jax.worlds import stages, world_model
 from pewm_jax.worlds.pewm import world as pewm
 from tests.train import fakes
 

@@ -12,9 +12,9 @@ from pewm_jax.io import tree
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.render import RenderConfig
-from pewm_jax.train import sharding, stages, step
+from pewm_jax.train import sharding, step
 from pewm_jax.types import Clip
-from pewm_jax.worlds import world_model
+from pewm_jax.worlds import stages, world_model
 from pewm_jax.worlds.pewm.world import STAGES
 from tests.helpers import init_world, random_frames, randomise, with_reader
 

@@ -17,7 +17,7 @@ from pewm_jax import registry as kinds
 from pewm_jax.config import Config, ConfigError, StageConfig, Task, TrainSettings, register
 from pewm_jax.data import loader
 from pewm_jax.io import tree
-from pewm_jax.train import loop, stages
+from pewm_jax.train import loop, runs
 from pewm_jax.train import watch as samples
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -154,6 +154,6 @@ def test_its_settings_come_back_from_json_and_stages_of_no_steps_are_refused(lin
     nothing = StageConfig(steps=0)
     idle = config(tmp_path, warm_up=nothing, fit=nothing, fit2=nothing)
     with pytest.raises(ConfigError, match=r"train\.fit\.steps and train\.fit2\.steps are all 0"):
-        stages.planned(idle)
+        runs.planned(idle)
     some = config(tmp_path, warm_up=nothing)
-    assert [stage.name for stage in stages.planned(some)] == ["fit", "fit2"]
+    assert [stage.name for stage in runs.planned(some)] == ["fit", "fit2"]
