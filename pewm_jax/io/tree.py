@@ -54,22 +54,14 @@ def unflatten(leaves: Mapping[str, Any]) -> Params:
 
 
 def assign(rules: Sequence[tuple[str, T]], tree: Any, what: str = "rules") -> Any:
-    """Replace every leaf by the value of the first rule whose pattern matches its path.
+    """Replace every leaf of a pytree by the value of the first rule whose pattern matches its path.
 
     Example::
 
         assign(((r".*/kernel", True), (r".*/bias", False)), params)  # a weight-decay mask
 
-    Args:
-        rules: (pattern, value) pairs; the first match wins.
-        tree: any pytree.
-        what: name of the rules in the error message.
-
-    Returns:
-        A tree of the same structure with values in place of leaves.
-
     Raises:
-        TreeError: no rule matches some leaves.
+        TreeError: no rule matches some leaves; the message names the rules by ``what``.
     """
     compiled = [(re.compile(pattern), value) for pattern, value in rules]
     unmatched: list[str] = []
@@ -147,10 +139,9 @@ def mismatches(tree: Any, like: Any) -> list[str]:
 
 
 def require_like(tree: Any, like: Any, what: str) -> None:
-    """Raise an error if two trees differ in paths or shapes.
+    """Raise TreeError if two trees differ in paths or shapes.
 
-    Raises:
-        TreeError: they differ; the message names ``what`` and lists the differences.
+    It names ``what`` and the differences.
     """
     wrong = mismatches(tree, like)
     if wrong:

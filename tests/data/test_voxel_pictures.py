@@ -13,7 +13,7 @@ from pewm_jax.data.loader import require_same_cells
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
 from pewm_jax.data.voxel_pictures import grid_from_camera
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig
-from pewm_jax.geometry import block_light
+from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.types import Camera
@@ -44,7 +44,7 @@ def test_a_room_of_blocks_is_lit_by_side_distance_and_corner():
     np.testing.assert_allclose(seen.depth_THW[0, middle, middle], 3 * CELL - 0.01, atol=1e-4)
     assert seen.ids_THW[0, middle, middle] == BROWN
     # Light as the formula says: met across x, at 1.49 m; far from corners.
-    wanted = np.array(PALETTE["brown"]) * 0.88 / (1 + (1.49 / block_light.HALF_M) ** 2)
+    wanted = np.array(PALETTE["brown"]) * 0.88 / (1 + (1.49 / march.HALF_M) ** 2)
     np.testing.assert_allclose(rgb[middle, middle], wanted, atol=1.0)
     floor, ceiling = rgb[-1, middle].mean(), rgb[0, middle].mean()
     assert floor > 1.3 * ceiling

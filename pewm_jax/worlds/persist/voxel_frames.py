@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.data.voxels import PALETTE
-from pewm_jax.geometry import block_light
+from pewm_jax.geometry import march
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
 from pewm_jax.memory.class_grid import EMPTY, UNKNOWN
@@ -211,9 +211,9 @@ def seen(
     surface = (hits >= VOTES).reshape((side,) * 3)
 
     # What lights the cells that are seen is known, so their own colours are.
-    borders = block_light.side_of((way_HW3 + (eye - corner_3)) / size)
+    borders = march.side_of((way_HW3 + (eye - corner_3)) / size)
     ones = jnp.ones(depth_HW.shape)
-    lit = block_light.light(surface, corner_3, size, eye, way_HW3, ones, borders)
+    lit = march.light(surface, corner_3, size, eye, way_HW3, ones, borders)
     colour_HW = _nearest(model, (rgb_HWC + 1) / 2 / lit[..., None])
     colours = model.memory.colours
     votes = jnp.zeros((side**3 + 1, colours), jnp.int32)

@@ -10,7 +10,7 @@ import pytest
 from pewm_jax import worlds
 from pewm_jax.data import voxel_pictures
 from pewm_jax.data.voxels import VoxelFrames, table_colours
-from pewm_jax.geometry import block_light
+from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, unproject
 from pewm_jax.geometry.march import through_pixels
 from pewm_jax.memory import class_grid
@@ -74,9 +74,9 @@ def test_the_light_that_is_read_is_the_light_that_was_drawn():
     grid, rgb, depth, camera = furnished()
     way = unproject(depth, camera) - camera.world_from_camera[:3, 3]
     at = (way + camera.world_from_camera[:3, 3] - LOW) / CELL
-    lit = block_light.light(
+    lit = march.light(
         grid > 0, LOW, CELL, camera.world_from_camera[:3, 3], way, np.ones(depth.shape),
-        block_light.side_of(at),
+        march.side_of(at),
     )  # fmt: skip
     one = Camera(camera.intrinsics_4[None], camera.world_from_camera[None])
     met = through_pixels(grid.astype(np.int32), LOW, CELL, one, SIZE, SIZE, 1).ids_L[0, ..., 0]
