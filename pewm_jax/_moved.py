@@ -170,6 +170,7 @@ MOVED = {
     "houses.furniture_parts": "houses.shapes",
     "houses.moving_pieces": "houses.fixtures",
     "houses.room_contents": "houses.furnish",
+    "houses.shell": "houses.generate",
     "memory.boxes": "memory.cells",
     "memory.class_edit": "memory.class_grid",
     "memory.feature_build": "memory.feature_cache",
