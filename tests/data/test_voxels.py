@@ -24,9 +24,8 @@ from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
 from pewm_jax.data.record_format import DamagedError
 from pewm_jax.data.recordings import turned
 from pewm_jax.data.scenes import house
-from pewm_jax.data.show import draw_voxels
+from pewm_jax.data.show import draw_voxels, grid_from_camera
 from pewm_jax.data.validate import ValidateConfig, validate
-from pewm_jax.data.voxel_pictures import grid_from_camera
 from pewm_jax.data.voxelise import crop_grids, fill, lattice_of, split_at_borders
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig, class_ids, table_colours
 from pewm_jax.geometry.cameras import unproject
