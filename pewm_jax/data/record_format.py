@@ -127,11 +127,7 @@ def _absolute(header: dict[str, Any], payload: int) -> dict[str, Any]:
 
 
 def check_span(record: bytes, offset: int, size: int, where: str, field: str) -> None:
-    """Raise an error if a record ends before a field does.
-
-    Raises:
-        DamagedError: the record is truncated.
-    """
+    """Raise DamagedError if a record ends before a field does."""
     if offset + size > len(record):
         raise DamagedError(
             f"{where}, field {field}: the record ends after {len(record)} bytes but the field "

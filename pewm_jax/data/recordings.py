@@ -41,13 +41,7 @@ TUM_TOLERANCE_S = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class RecordedFrame:
-    """One frame of a recording.
-
-    Attributes:
-        colour: path of the colour image.
-        depth: path of the depth image.
-        world_from_camera: (4, 4) float64 camera-to-world in the recording's own world.
-    """
+    """One frame: paths of its images, and its float64 pose (4, 4) in the recording's own world."""
 
     colour: Path
     depth: Path
@@ -140,11 +134,9 @@ def _require_same_numbers(folder: Path, colours: list[Path], depths: list[Path])
 
 
 def _numbers(files: list[Path], place: int) -> list[int] | None:
-    """Return one number per name; None if a name has none, or two names share one.
+    """Return the first (0) or last (−1) number of each name.
 
-    Args:
-        files: the files.
-        place: index of the number among those in a name.
+    None if some have none or share one.
     """
     found = [re.findall(r"[0-9]+", path.stem) for path in files]
     numbers = [int(each[place]) for each in found if each]
@@ -168,8 +160,7 @@ def _images(folder: Path, names: tuple[str, ...], what: str) -> list[Path]:
 def read_log(path: Path) -> np.ndarray:
     """Read an Open3D ``.log`` trajectory as (T, 4, 4) camera-to-world.
 
-    Raises:
-        UserError: it does not parse; the message names the line.
+    UserError names a bad line.
     """
     lines = [(i, line.split()) for i, line in enumerate(_lines(path), 1) if line.strip()]
     if len(lines) % 5:
@@ -213,12 +204,11 @@ def _nearest(times: np.ndarray, stamp: float) -> int | None:
 def _stamped(path: Path) -> list[tuple[float, str]]:
     if not path.is_file():
         raise UserError(f"{path} does not exist; a TUM recording lists its images there.")
-    rows = []
-    for number, stamp, fields in _stamped_lines(path):
+    rows = _stamped_lines(path)
+    for number, _, fields in rows:
         if not fields:
             raise UserError(f"{path}, line {number}: a time stamp without a file name.")
-        rows.append((stamp, fields[0]))
-    return rows
+    return [(stamp, fields[0]) for _, stamp, fields in rows]
 
 
 def _stamped_lines(path: Path) -> list[tuple[int, float, list[str]]]:

@@ -34,9 +34,9 @@ class Rendered:
     """Rendered images.
 
     Attributes:
-        rgb_THWC: (T, H, W, 3) uint8, black where nothing is hit.
-        depth_THW: (T, H, W) float32 metres along the camera's z axis, 0 where nothing is hit.
-        ids_THW: (T, H, W) int32 index into ``Scene.objects``, −1 where nothing is hit.
+        rgb_THWC: uint8, black where nothing is hit.
+        depth_THW: float32 metres along the camera's z axis, 0 where nothing is hit.
+        ids_THW: int32 index into ``Scene.objects``, −1 where nothing is hit.
     """
 
     rgb_THWC: np.ndarray
@@ -45,13 +45,7 @@ class Rendered:
 
 
 def render(scene: Scene, camera: Camera, height: int, width: int) -> Rendered:
-    """Render a scene from T cameras.
-
-    Args:
-        scene: the scene.
-        camera: (T,) cameras: intrinsics (T, 4) or one (4,) for all, poses (T, 4, 4), metres.
-        height: image height in pixels.
-        width: image width in pixels.
+    """Render a scene from T cameras: intrinsics (T, 4) or one (4,) for all, poses (T, 4, 4).
 
     Raises:
         UserError: the cameras have the wrong shape, are not finite, or the image is empty.
@@ -136,14 +130,7 @@ AIR = 24
 
 
 def draw_blocks(voxels: VoxelFrames, camera: Camera, height: int, width: int) -> Rendered:
-    """Render the grids of T frames as block worlds from T cameras, on the CPU.
-
-    Args:
-        voxels: the grids.
-        camera: (T,) cameras: intrinsics (T, 4) or one (4,) for all, of images of ``height`` ×
-            ``width``.
-        height: image height in pixels.
-        width: image width in pixels.
+    """Render the grids of T frames as block worlds from T cameras (as for ``render``), on the CPU.
 
     Returns:
         Colours, z-depth (0 where a ray hits nothing), and class ids as ids (−1 there).

@@ -101,8 +101,8 @@ def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
 
     Args:
         path: the file.
-        up: which axis of the file points up; ``auto`` is y for glTF, as in its specification, and
-            z for all others.
+        up: which axis of the file points up; ``auto`` is y for glTF, as in its specification, and z
+            for all others.
 
     Raises:
         UserError: the file is absent or unreadable, or holds no usable triangles.
@@ -193,27 +193,25 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
     """Concatenate instances, bake light and lay out the shading rows."""
     starts = np.cumsum([0] + [len(part.vertices_V3) for part in parts[:-1]])
     vertices = np.concatenate([part.vertices_V3 for part in parts])
-    faces = np.concatenate(
-        [part.surface.faces_F3 + start for part, start in zip(parts, starts, strict=True)]
-    ).astype(np.int32)
+    placed = [part.surface.faces_F3 + start for part, start in zip(parts, starts, strict=True)]
+    faces = np.concatenate(placed).astype(np.int32)
     counts = [len(part.surface.faces_F3) for part in parts]
+
+    def per_face(values: list[Any]) -> np.ndarray:
+        return np.repeat(np.array(values), counts)
+
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double_area = np.linalg.norm(cross, axis=-1, keepdims=True)
-    facing = np.repeat([-1.0 if part.mirrored else 1.0 for part in parts], counts)
+    facing = per_face([-1.0 if part.mirrored else 1.0 for part in parts])
     normals = cross / double_area.clip(1e-12) * facing[:, None]
     colour = np.concatenate([part.surface.colour_F33 for part in parts])
     uv = np.concatenate([part.surface.uv_F32 for part in parts])
-    images: list[np.ndarray] = [np.full((1, 1, 3), 255, np.uint8)]
-    rows: dict[int, int] = {}
-    image_of_part = []
-    for part in parts:
-        image = part.surface.image
-        if image is not None and id(image) not in rows:
-            rows[id(image)] = len(images)
-            images.append(image)
-        image_of_part.append(0 if image is None else rows[id(image)])
-    texture = np.repeat(np.array(image_of_part, np.int32) * LEVELS, counts)
+    white = np.full((1, 1, 3), 255, np.uint8)
+    image_of_part = [white if p.surface.image is None else p.surface.image for p in parts]
+    images = list({id(image): image for image in [white, *image_of_part]}.values())
+    rows = {id(image): row for row, image in enumerate(images)}
+    texture = per_face([rows[id(image)] for image in image_of_part]).astype(np.int32) * LEVELS
     textures = pack(images)
     size = np.stack([textures.width_L[texture], textures.height_L[texture]], -1)
     edges = (uv[:, 1:] - uv[:, :1]) * size[:, None, :]
@@ -224,7 +222,7 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
         vertices_V3=vertices,
         faces_F3=faces,
         normals_F3=normals,
-        object_F=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
+        object_F=per_face(list(range(len(parts)))).astype(np.int32),
         objects=tuple(part.node for part in parts),
         shading_16F=np.zeros((16, len(faces)), np.float32),
         texture_F=texture,
@@ -232,11 +230,11 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
         albedo_F3=_albedo(parts),
         metadata=metadata,
     )
-    bare = np.repeat(np.array([part.surface.bare for part in parts]), counts)
+    bare = per_face([part.surface.bare for part in parts])
     if soft:
         centred = vertices - scene.centre_3
         light = shading.soft_light(scene.tracer, centred, faces, normals)
-        light[np.repeat([part.surface.glowing for part in parts], counts)] = 1.0
+        light[per_face([part.surface.glowing for part in parts])] = 1.0
         colour = colour * light
     elif bare.any():
         light = shading.face_light(normals)[:, None, :]
@@ -328,12 +326,12 @@ def read_surface(mesh: trimesh.Trimesh, where: str) -> Surface:
         glow = getattr(visual.material, "emissiveFactor", None)
         glowing = glow is not None and float(np.max(glow)) > 0
         return Surface(vertices, faces, colour, uv, image, bare, glowing)
-    if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
-        colours = np.asarray(visual.vertex_colors)[:, :3].astype(np.float32) / 255
-        return Surface(vertices, faces, colours[faces], uv, None, bare=False)
-    if isinstance(visual, ColorVisuals) and visual.kind == "face":
-        colours = np.asarray(visual.face_colors)[:, :3].astype(np.float32) / 255
-        return Surface(vertices, faces, colour * colours[:, None], uv, None, bare=False)
+    if isinstance(visual, ColorVisuals) and visual.kind in ("vertex", "face"):
+        by_vertex = visual.kind == "vertex"
+        rgba = visual.vertex_colors if by_vertex else visual.face_colors
+        rgb = np.asarray(rgba)[:, :3].astype(np.float32) / 255
+        colour = rgb[faces] if by_vertex else colour * rgb[:, None]
+        return Surface(vertices, faces, colour, uv, None, bare=False)
     return Surface(vertices, faces, colour * np.float32(GREY / 255), uv, None, bare=True)
 
 

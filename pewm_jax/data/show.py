@@ -230,13 +230,7 @@ def _write(image: np.ndarray, text: str, where: tuple[int, int]) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class GridView:
-    """A grid as a camera sees it.
-
-    Attributes:
-        rgb_HWC: (H, W, 3) uint8 colours of the classes, shaded by the side of the cell.
-        depth_HW: (H, W) float32 metres along z, 0 where the ray hits nothing.
-        classes_HW: (H, W) class ids, 0 where the ray hits nothing.
-    """
+    """A grid as a camera sees it: shaded colours, z-depth in metres, class ids (0: no hit)."""
 
     rgb_HWC: np.ndarray
     depth_HW: np.ndarray
@@ -246,15 +240,7 @@ class GridView:
 def grid_from_camera(
     voxels: VoxelFrames, frame: int, camera: Camera, height: int, width: int
 ) -> GridView:
-    """Return the grid of one frame as its camera sees it.
-
-    Args:
-        voxels: the grids of T frames.
-        frame: number of the frame.
-        camera: (T,) cameras, whose intrinsics belong to images of ``height`` × ``width``.
-        height: image height in pixels.
-        width: image width in pixels.
-    """
+    """Return the grid of one frame as its camera, one of (T,), sees it."""
     one = Camera(camera.intrinsics_4[frame : frame + 1], camera.world_from_camera[frame][None])
     hits = _march(height, width)(
         voxels.classes_TXYZ[frame], voxels.origin_T3[frame], np.float32(voxels.cell_m), one

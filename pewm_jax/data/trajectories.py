@@ -37,7 +37,7 @@ class Trajectory:
     """Poses of the agent and its actions.
 
     Attributes:
-        planar_T3: (T, 3) float64 x, y, yaw in the world, metres and radians.
+        planar_T3: float64 x, y, yaw in the world, metres and radians.
         actions: (T − 1, 3) float64 dx, dy, dyaw.
         action_ids: (T − 1,) int32, or None for continuous actions.
         return_frame: the frame at which a revisit trajectory turns back, or None.

@@ -107,10 +107,7 @@ class VoxelsConfig:
 def class_ids(config: VoxelsConfig, kind_N: np.ndarray, rgb_N3: np.ndarray) -> np.ndarray:
     """Return (N,) class ids of surfaces.
 
-    Args:
-        config: the classes.
-        kind_N: (N,) indices into ``KINDS``.
-        rgb_N3: (N, 3) their colours without light, in [0, 1].
+    The kinds are indices into ``KINDS``, the colours are without light, in [0, 1].
     """
     row = config.kind_names.index
     of_kind = [row(kind if config.kinds == "all" else GROUPS[kind]) for kind in KINDS]
@@ -167,7 +164,7 @@ class VoxelFrames:
 
     Attributes:
         classes_TXYZ: (T, n, n, n) uint8 or uint16 class ids, 0 where nothing is.
-        origin_T3: (T, 3) float32 world position of each grid's lowest corner, metres.
+        origin_T3: float32 world position of each grid's lowest corner, metres.
         cell_m: side of a cell, metres.
         names: the table of classes.
     """
@@ -230,11 +227,7 @@ def header_of(voxels: VoxelFrames) -> dict[str, Any]:
 
 
 def grid_in(stream: dict[str, Any], where: str) -> VoxelGrid:
-    """Return the grid that the header of a record describes.
-
-    Raises:
-        DamagedError: the header is incomplete or inconsistent.
-    """
+    """Return the grid that the header of a record describes; DamagedError if it is inconsistent."""
     try:
         cell, side, dtype = float(stream["cell_m"]), int(stream["side"]), str(stream["dtype"])
         names = tuple(map(str, stream["classes"]))
@@ -251,11 +244,7 @@ def grid_in(stream: dict[str, Any], where: str) -> VoxelGrid:
 
 
 def require_alike(first: VoxelGrid, other: VoxelGrid, where: str) -> None:
-    """Raise an error if grids differ from others of the same data.
-
-    Raises:
-        UserError: the cell, the side or the table of classes differs.
-    """
+    """Raise UserError if grids differ in cell, side or classes from others of the same data."""
     if (other.side, other.dtype) != (first.side, first.dtype) or not np.isclose(
         other.cell_m, first.cell_m
     ):
@@ -285,12 +274,7 @@ LOOKS, STEP = 8, 3
 
 
 def check_voxels(voxels: VoxelFrames, frames: int, where: str) -> None:
-    """Check grids before they are written.
-
-    Args:
-        voxels: the grids.
-        frames: the expected number of grids.
-        where: their name in messages.
+    """Check grids before they are written; ``frames`` is their expected number.
 
     Raises:
         UserError: the number of grids is wrong, a grid is not a cube, a class is not in the table,
@@ -352,15 +336,9 @@ def disagreement(
 ) -> tuple[int, float] | None:
     """Return the frame that disagrees most with its grid, and the share of floating points.
 
-    A point that the camera sees in the grid floats if its cell and the cells around it are empty.
-
-    Args:
-        voxels: the grids of T frames.
-        depth_THW: their depths, metres.
-        camera: (T,) their cameras.
-
-    Returns:
-        None if at most ``MOST_FLOATING`` of the points of all frames float.
+    A point that the camera sees in the grid, by the depths (T, H, W) in metres, floats if its cell
+    and the cells around it are empty. None if at most ``MOST_FLOATING`` of the points of all frames
+    float.
     """
     frames, height, width = depth_THW.shape
     rows, columns = np.mgrid[0:height:STEP, 0:width:STEP]
