@@ -21,6 +21,7 @@ from pewm_jax.config import UserError
 from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
 from pewm_jax.data.voxels import LOOKS, disagreement, off_lattice, outside
 from pewm_jax.geometry.actions import PLANAR
+from pewm_jax.geometry.cameras import measured_points
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
 """Plausible median depths, metres; a recording outside this range has a wrong unit."""
@@ -312,13 +313,8 @@ def share_floating(
     fx, fy, cx, cy = np.asarray(episode.intrinsics_4, np.float64)
     pose = np.asarray(episode.world_from_camera, np.float64)
     step = max(1, int(np.sqrt(height * width / SAMPLES)))
-    v, u = np.mgrid[0:height:step, 0:width:step]
-    z = depth_THW[first][v, u].astype(np.float64)
-    seen = z > 0
-    u, v, z = u[seen] + 0.5, v[seen] + 0.5, z[seen]
-    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], -1)
-    world = points @ pose[first, :3, :3].T + pose[first, :3, 3]
-    local = (world - pose[second, :3, 3]) @ pose[second, :3, :3]
+    points, _ = measured_points(depth_THW[first], episode.intrinsics_4, pose[first], step)
+    local = (points - pose[second, :3, 3]) @ pose[second, :3, :3]
     z = local[:, 2]
     safe = np.where(z > 0.1, z, 1.0)
     u, v = local[:, 0] / safe * fx + cx - 0.5, local[:, 1] / safe * fy + cy - 0.5

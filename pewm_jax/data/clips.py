@@ -143,32 +143,6 @@ def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
     return steps_TSA.reshape(len(steps_TSA), stride * actions_TA.shape[1]).astype(np.float32)
 
 
-def clip_at(
-    config: Config, episode: Episode, start: int, stride: int = 1, frames: int | None = None
-) -> Clip:
-    """Return the clip at given frames; its context is evenly spaced, without randomness.
-
-    Args:
-        config: ``clip.frames`` and ``data.context``.
-        episode: the episode.
-        start: its first frame.
-        stride: actions between two consecutive frames.
-        frames: its length, by default ``clip.frames``.
-
-    Raises:
-        UserError: the episode ends before the clip does.
-    """
-    count = config.model.clip.frames if frames is None else frames
-    chosen = start + stride * np.arange(count)
-    if start < 0 or chosen[-1] >= episode.length:
-        raise UserError(
-            f"episode {episode.name} has {episode.length} frames, so it has no clip from {start} "
-            f"to {chosen[-1]}; start earlier or collect longer episodes."
-        )
-    slots = config.data.context
-    return cut(episode, Choice(chosen, choose_context(start, slots)), slots)
-
-
 def stack(clips: Sequence[Clip]) -> Clip:
     """Stack clips to a batch: every array gets a leading B.
 

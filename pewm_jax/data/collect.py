@@ -343,10 +343,7 @@ def _write_received(path: Path, made: Shard, content: bytes) -> Shard:
     """Write a shard that another machine made, after comparing its hash."""
     if hashlib.sha256(content).hexdigest() != made.sha256:
         raise UserError(f"{path} arrived damaged; run the same command again to resume.")
-    with atomic.replacing(path) as partial, partial.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    atomic.write_bytes(path, content)
     return made
 
 

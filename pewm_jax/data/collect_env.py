@@ -269,8 +269,8 @@ def open_env(config: CollectEnvConfig) -> Any:
     Raises:
         UserError: no environment has this name, it cannot be created, or it is not an environment.
     """
-    module, _, name = config.env.partition(":")
-    made = getattr(_module(module, "--env"), name, None) or _registered(config, name)
+    made, name = _named(config.env, "--env")
+    made = _registered(config, name) if made is None else made
     fix = ": fix it, or its --env-args."
     env = _call_user(config, " cannot be created", fix, made, **json.loads(config.env_args))
     for wanted in ("reset", "step", "close", "action_space"):
@@ -297,14 +297,10 @@ def _registered(config: CollectEnvConfig, name: str) -> Callable[..., Any]:
 
 
 def open_policy(config: CollectEnvConfig) -> Callable[[Any], Any] | None:
-    """Return the policy that ``--policy`` names, or None.
-
-    UserError if the function does not exist.
-    """
+    """Return the policy that ``--policy`` names, or None; UserError if it does not exist."""
     if not config.policy:
         return None
-    module, _, name = config.policy.partition(":")
-    found = getattr(_module(module, "--policy"), name, None)
+    found, name = _named(config.policy, "--policy")
     if not callable(found):
         raise UserError(
             f"--policy {config.policy}: the module has no function {name}; give MODULE:FUNCTION "
@@ -313,12 +309,13 @@ def open_policy(config: CollectEnvConfig) -> Callable[[Any], Any] | None:
     return found
 
 
-def _module(name: str, flag: str) -> Any:
-    """Import a user's module; it may also be in the current folder."""
+def _named(text: str, flag: str) -> tuple[Any, str]:
+    """Return what MODULE:NAME names, or None, and NAME; the module may be in the current folder."""
+    module, _, name = text.partition(":")
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
-    return kinds.imported(name, flag)
+    return getattr(kinds.imported(module, flag), name, None), name
 
 
 def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) -> None:

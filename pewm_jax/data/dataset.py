@@ -62,11 +62,7 @@ class Manifest:
 
 
 def write_shard(path: Path, records: Iterable[bytes]) -> Shard:
-    """Write records to an ArrayRecord file atomically.
-
-    Raises:
-        UserError: the file cannot be written, e.g. because the disk is full.
-    """
+    """Write records to an ArrayRecord file atomically; UserError if that fails (a full disk)."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(path) as partial:
         # Images are compressed already; with one record per group, reading a single one is cheap.
@@ -104,11 +100,7 @@ def describe_shard(path: Path) -> Shard:
 
 
 def count_records(path: Path) -> int:
-    """Return the number of records of an ArrayRecord file.
-
-    Raises:
-        UserError: the file is not an ArrayRecord file, or is truncated.
-    """
+    """Return the number of records; UserError for a truncated file, or one of another kind."""
     state = "it is truncated or damaged"
     with _opened(path, f"{path} is not a readable ArrayRecord file", state) as reader:
         count = reader.num_records()
@@ -118,11 +110,7 @@ def count_records(path: Path) -> int:
 
 
 def read_record(path: Path, index: int) -> bytes:
-    """Read one record of an ArrayRecord file.
-
-    Raises:
-        UserError: the record cannot be read.
-    """
+    """Read one record of an ArrayRecord file; UserError if it cannot be read."""
     failure = f"{path}, record {index} cannot be read"
     with _opened(path, failure, "the file is damaged") as reader:
         return reader.read([index])[0]

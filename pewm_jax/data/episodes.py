@@ -16,12 +16,10 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.data import voxels as voxel_frames
 from pewm_jax.data.record_format import (
-    CONVENTIONS,
-    UNITS,
-    VERSION,
     DamagedError,
     array_shapes,
     check_span,
+    new_header,
     pack_record,
     read_header,
     shape_fits,
@@ -124,11 +122,7 @@ class Episode:
         return Frames(rgb, depth, self.camera(chosen))
 
     def ids(self, indices: Sequence[int] | np.ndarray | None = None) -> np.ndarray:
-        """Decode instance ids (T, H, W) int32, −1 = nothing.
-
-        Raises:
-            UserError: the episode has no instance ids.
-        """
+        """Decode instance ids (T, H, W) int32, −1 = nothing; UserError if the episode has none."""
         if not self.has_ids:
             raise UserError(f"episode {self.name} has no instance ids; collect it with --ids.")
         chosen = self._chosen(indices)
@@ -136,11 +130,7 @@ class Episode:
 
     @property
     def voxel_grid(self) -> VoxelGrid | None:
-        """The cell, side and classes of the grids around the agent; None if none were recorded.
-
-        Raises:
-            DamagedError: the header is inconsistent.
-        """
+        """The grids' cell, side and classes, or None; DamagedError for an inconsistent header."""
         stream = self.header["streams"].get("voxels")
         return None if stream is None else voxel_frames.grid_in(stream, f"episode {self.name}")
 
@@ -194,7 +184,6 @@ def write_episode(
         UserError: the arrays' shapes or dtypes do not fit together.
     """
     _check_arrays(arrays, name)
-    frames, height, width = arrays.depth_THW.shape
     streams: dict[str, list[bytes]] = {
         "rgb": [_png(image[..., ::-1]) for image in arrays.rgb_THWC],
         "depth": [_png(image) for image in to_millimetres(arrays.depth_THW)],
@@ -212,21 +201,8 @@ def write_episode(
         "action_ids": (arrays.action_ids, "<i4"),
         "voxel_origins": (None if voxels is None else voxels.origin_T3, "<f4"),
     }
-    header: dict[str, Any] = {
-        "format": "pewm-episode",
-        "version": VERSION,
-        "name": name,
-        "scene": scene,
-        "frames": frames,
-        "height": height,
-        "width": width,
-        "units": UNITS,
-        "conventions": CONVENTIONS,
-        "info": dict(info or {}),
-        "arrays": {},
-        "streams": {},
-    }
     kept = {field: np.asarray(x, dtype) for field, (x, dtype) in small.items() if x is not None}
+    header = new_header(name, scene, arrays.depth_THW.shape, info or {})
     return pack_record(header, kept, streams, about)
 
 
@@ -272,17 +248,13 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
     if ("voxels" in header["streams"]) != ("voxel_origins" in arrays):
         raise DamagedError(f"{where} lacks voxels or voxel_origins; write it again.")
     return Episode(
-        name=header["name"],
-        scene=header["scene"],
+        **{field: header[field] for field in ("name", "scene", "height", "width", "info")},
         length=frames,
-        height=header["height"],
-        width=header["width"],
         intrinsics_4=arrays["intrinsics"],
         world_from_camera=arrays["world_from_camera"],
         actions=arrays.get("actions"),
         action_ids=arrays.get("action_ids"),
         voxel_origin_T3=arrays.get("voxel_origins"),
-        info=header["info"],
         header=header,
         record=record,
     )

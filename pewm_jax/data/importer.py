@@ -12,25 +12,7 @@ import numpy as np
 import tyro
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data.checks import (
-    ACTION_M,
-    ACTION_RAD,
-    Problem,
-    action_errors,
-    check_depth,
-    check_episode,
-)
-from pewm_jax.data.dataset import (
-    MANIFEST,
-    Manifest,
-    Shard,
-    check_size,
-    describe_shard,
-    read_manifest,
-    read_record,
-    write_manifest,
-    write_shard,
-)
+from pewm_jax.data import checks, dataset
 from pewm_jax.data.episodes import (
     DEPTH_LIMIT_M,
     SATURATED,
@@ -52,7 +34,7 @@ _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 class _Imported:
     """A shard of one imported episode: its frames, and whether it has actions and voxels."""
 
-    shard: Shard
+    shard: dataset.Shard
     frames: int
     actions: bool
     voxels: bool
@@ -139,7 +121,7 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
     scale = (width / source_size[0], height / source_size[1])
     pose = turn @ np.stack([frame.world_from_camera for frame in frames])
     # Check the units before large depths are dropped, which could hide that they are wrong.
-    _refuse(check_depth(depth, str(config.src)), config, frames)
+    _refuse(checks.check_depth(depth, str(config.src)), config, frames)
     depth[depth > config.max_depth] = 0
     voxels = read_voxels(config.src, [frame.colour for frame in frames], turn)
     if voxels is not None:
@@ -150,8 +132,8 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
     )
     info = {"policy": "recorded", "stride": config.stride, "source": config.src.resolve().name}
     record = write_episode(arrays, name, name, info)
-    _refuse(check_episode(read_episode(record), str(config.src)), config, frames)
-    shard = write_shard(path, [record])
+    _refuse(checks.check_episode(read_episode(record), str(config.src)), config, frames)
+    shard = dataset.write_shard(path, [record])
     imported.append(_Imported(shard, len(frames), acts is not None, voxels is not None))
     _write_manifest(folder, imported)
     moves = "poses only (6 degrees of freedom)" if acts is None else "planar actions"
@@ -167,7 +149,7 @@ def _write_manifest(folder: Path, imported: list[_Imported]) -> None:
         if field != "voxels" or any(values.values()):
             settings[field] = values
     shards, total = tuple(one.shard for one in imported), sum(one.frames for one in imported)
-    write_manifest(folder, Manifest(folder.name, shards, settings, total))
+    dataset.write_manifest(folder, dataset.Manifest(folder.name, shards, settings, total))
 
 
 def world_from_recording(up: str) -> np.ndarray:
@@ -188,8 +170,12 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     if len(world_from_camera) < 2:
         return None
     actions = np.asarray(actions_between(np.asarray(world_from_camera, np.float32)))
-    metres, radians = action_errors(world_from_camera, actions)
-    return actions if bool(((metres < ACTION_M) & (radians < ACTION_RAD)).all()) else None
+    metres, radians = checks.action_errors(world_from_camera, actions)
+    return (
+        actions
+        if bool(((metres < checks.ACTION_M) & (radians < checks.ACTION_RAD)).all())
+        else None
+    )
 
 
 def _other_shards(config: ImportConfig, replaced: Path, name: str) -> list[_Imported]:
@@ -197,16 +183,16 @@ def _other_shards(config: ImportConfig, replaced: Path, name: str) -> list[_Impo
     folder = replaced.parent
     if not folder.exists():
         return []
-    if not (folder / MANIFEST).is_file():
+    if not (folder / dataset.MANIFEST).is_file():
         # A killed import leaves its shard, which is complete and checked because it was renamed.
         strays = sorted(folder.glob("recording-*.array_record"))
         if len(strays) < len([*folder.glob("*.array_record"), *folder.glob("*.json")]):
             raise UserError(
                 f"{folder} holds an unfinished collection; finish it, or give another --split."
             )
-        return [_inspect(path, describe_shard(path)) for path in strays if path != replaced]
+        return [_inspect(path, dataset.describe_shard(path)) for path in strays if path != replaced]
     # The shard to replace may be newer than the list, if an import was killed between the two.
-    manifest = read_manifest(folder, check_files=False)
+    manifest = dataset.read_manifest(folder, check_files=False)
     if manifest.settings.get("made_by") != "import":
         raise UserError(f"{folder} was made by `collect`; import into another --split or folder.")
     kept = [shard for shard in manifest.shards if shard.file != replaced.name]
@@ -215,7 +201,7 @@ def _other_shards(config: ImportConfig, replaced: Path, name: str) -> list[_Impo
             f"{folder} already has an episode named {name}; give another --name or --overwrite."
         )
     for shard in kept:
-        check_size(folder / shard.file, shard)
+        dataset.check_size(folder / shard.file, shard)
     frames, actions = manifest.settings["frames"], manifest.settings.get("actions", {})
     voxels = manifest.settings.get("voxels", {})  # not listed where no recording has any
     return [
@@ -226,9 +212,9 @@ def _other_shards(config: ImportConfig, replaced: Path, name: str) -> list[_Impo
     ]
 
 
-def _inspect(path: Path, shard: Shard) -> _Imported:
+def _inspect(path: Path, shard: dataset.Shard) -> _Imported:
     """Open a shard and return which fields it contains."""
-    episode = read_episode(read_record(path, 0), str(path))
+    episode = read_episode(dataset.read_record(path, 0), str(path))
     acts, grid = episode.actions is not None, episode.voxel_grid
     return _Imported(shard, episode.length, acts, grid is not None)
 
@@ -240,7 +226,7 @@ def _require_same_grid(
     for one in imported:
         if one.voxels:
             path = folder / one.shard.file
-            there = read_episode(read_record(path, 0), str(path)).voxel_grid
+            there = read_episode(dataset.read_record(path, 0), str(path)).voxel_grid
             assert isinstance(there, VoxelGrid)
             require_alike(there, voxels.grid, str(config.src / "voxels"))
             return
@@ -305,7 +291,9 @@ def _read(path: Path, flags: int) -> np.ndarray:
     return image
 
 
-def _refuse(problems: list[Problem], config: ImportConfig, frames: list[RecordedFrame]) -> None:
+def _refuse(
+    problems: list[checks.Problem], config: ImportConfig, frames: list[RecordedFrame]
+) -> None:
     """Raise UserError for the first problem, naming the depth image's file."""
     if not problems:
         return

@@ -9,6 +9,7 @@ another, drawn from the same seed and position, so the replacement depends only 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -111,12 +112,7 @@ class _DrawClip(grain.transforms.RandomMap):
     grid: VoxelGrid | None = None
 
     def random_map(self, element: int, rng: np.random.Generator) -> _Drawn:
-        """Draw a clip.
-
-        Raises:
-            UserError: the episode does not fit the configuration, more records do not decode than
-                ``data.bad_records`` allows, or none does.
-        """
+        """Draw a clip from the record, or from another one if it does not decode."""
         record, refused = element, set()
         while True:
             try:
@@ -341,17 +337,15 @@ def require_same_cells(world: World, episode: Episode) -> None:
     memory: Any = getattr(world, "memory", None)
     if not getattr(memory, "CLASSES", False) or episode.voxel_grid is None:
         return
-    for kinds in ("all", "groups"):
-        for colours in range(1, len(PALETTE) + 1):
-            same = (kinds, colours) == (memory.kinds, memory.colours)
-            if not same and VoxelsConfig(kinds=kinds, colours=colours).names == (
-                episode.voxel_grid.names
-            ):
-                raise ConfigError(
-                    f"episode {episode.name} was collected with --voxels.kinds {kinds} "
-                    f"--voxels.colours {colours}, and memory.kinds is {memory.kinds}, memory."
-                    f"colours {memory.colours}: use the same."
-                )
+    for made in itertools.product(("all", "groups"), range(1, len(PALETTE) + 1)):
+        kinds, colours = made
+        names = VoxelsConfig(kinds=kinds, colours=colours).names
+        if made != (memory.kinds, memory.colours) and names == episode.voxel_grid.names:
+            raise ConfigError(
+                f"episode {episode.name} was collected with --voxels.kinds {kinds} "
+                f"--voxels.colours {colours}, and memory.kinds is {memory.kinds}, memory."
+                f"colours {memory.colours}: use the same."
+            )
     pictures = episode.info.get("pictures", "surfaces")
     if pictures != memory.pictures:
         raise ConfigError(

@@ -195,11 +195,7 @@ def scenes_of(config: CollectConfig, split: str) -> tuple[Path, ...]:
 
 
 def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
-    """Make one episode and return its record.
-
-    Raises:
-        UserError: a mesh does not load or has no floor to stand on.
-    """
+    """Return the record of one episode; UserError if a mesh does not load or has no floor."""
     moving: MovingHouse | None = None
     if config.scene:
         scenes = scenes_of(config, split)

@@ -240,15 +240,6 @@ def line_is_free(grid: NavGrid, start_xy: np.ndarray, end_xy: np.ndarray) -> boo
     return bool(is_free(grid, np.asarray(start_xy) + steps * (end_xy - start_xy)).all())
 
 
-def rooms_reached(grid: NavGrid, rooms: list[list[float]]) -> list[bool]:
-    """Return for each room rectangle [x0, y0, x1, y1] whether some free cell lies in it."""
-    centres = grid.centre_of(np.argwhere(grid.free_YX))
-    return [
-        bool((((x0, y0) < centres) & (centres < (x1, y1))).all(-1).any())
-        for x0, y0, x1, y1 in rooms
-    ]
-
-
 def _dijkstra(grid: NavGrid, source_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (Y, X) to a source and, per flat cell, the next cell towards it."""
     row, column = grid.cell_of(nearest_free(grid, source_xy))

@@ -16,21 +16,6 @@ from pewm_jax.config import UserError
 
 MAGIC = b"PEWMEPIS"
 VERSION = 1
-FIELDS = (
-    "format",
-    "version",
-    "name",
-    "scene",
-    "frames",
-    "height",
-    "width",
-    "units",
-    "conventions",
-    "info",
-    "arrays",
-    "streams",
-)
-"""Required fields of a header."""
 
 CONVENTIONS = {
     "camera": "OpenCV axes: x right, y down, z forward",
@@ -49,6 +34,24 @@ UNITS = {
     "intrinsics": "pixel",
     "actions": "metre, metre, radian",
 }
+
+
+def new_header(
+    name: str, scene: str, shape_THW: tuple[int, int, int], info: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the header of an episode without arrays and streams; it has all required fields."""
+    return {
+        "format": "pewm-episode",
+        "version": VERSION,
+        "name": name,
+        "scene": scene,
+        **dict(zip(("frames", "height", "width"), shape_THW, strict=True)),
+        "units": UNITS,
+        "conventions": CONVENTIONS,
+        "info": dict(info),
+        "arrays": {},
+        "streams": {},
+    }
 
 
 class DamagedError(UserError):
@@ -96,11 +99,8 @@ def pack_record(
     blobs: list[bytes] = []
     offset = 0
     for field, array in arrays.items():
-        header["arrays"][field] = {
-            "offset": offset,
-            "dtype": array.dtype.str,
-            "shape": list(array.shape),
-        }
+        place = {"offset": offset, "dtype": array.dtype.str, "shape": list(array.shape)}
+        header["arrays"][field] = place
         blobs.append(array.tobytes())
         offset += array.nbytes
     for stream, images in streams.items():
@@ -109,11 +109,8 @@ def pack_record(
             spans.append([offset, len(image)])
             blobs.append(image)
             offset += len(image)
-        header["streams"][stream] = {
-            "codec": "png",
-            **(about or {}).get(stream, {}),
-            "spans": spans,
-        }
+        own = (about or {}).get(stream, {})
+        header["streams"][stream] = {"codec": "png", **own, "spans": spans}
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     return b"".join([MAGIC, struct.pack("<I", len(text)), text, *blobs])
 
@@ -153,7 +150,8 @@ def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
         header = json.loads(record[start : start + length])
         version = header["version"]
         if version == VERSION:
-            header = _absolute({field: header[field] for field in FIELDS}, start + length)
+            required = new_header("", "", (0, 0, 0), {})
+            header = _absolute({field: header[field] for field in required}, start + length)
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError):
         raise DamagedError(
             f"{where}: the episode's header does not parse; the record is damaged, collect or "

@@ -20,8 +20,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from pewm_jax.config import UserError
 from pewm_jax.data.voxels import SIDE_LIMIT, VoxelFrames
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import DAMAGED
 
 COLOUR_FOLDERS = ("image", "color", "colour", "rgb")
 DEPTH_FOLDERS = ("depth",)
@@ -136,7 +135,7 @@ def _require_same_numbers(folder: Path, colours: list[Path], depths: list[Path])
 def _numbers(files: list[Path], place: int) -> list[int] | None:
     """Return the first (0) or last (−1) number of each name.
 
-    None if some have none or share one.
+    None if one has none or two share one.
     """
     found = [re.findall(r"[0-9]+", path.stem) for path in files]
     numbers = [int(each[place]) for each in found if each]
@@ -158,10 +157,7 @@ def _images(folder: Path, names: tuple[str, ...], what: str) -> list[Path]:
 
 
 def read_log(path: Path) -> np.ndarray:
-    """Read an Open3D ``.log`` trajectory as (T, 4, 4) camera-to-world.
-
-    UserError names a bad line.
-    """
+    """Read an Open3D ``.log`` trajectory as (T, 4, 4) poses; UserError names a bad line."""
     lines = [(i, line.split()) for i, line in enumerate(_lines(path), 1) if line.strip()]
     if len(lines) % 5:
         raise UserError(
@@ -176,16 +172,16 @@ def read_log(path: Path) -> np.ndarray:
 
 
 def _read_tum(folder: Path, trajectory: Path) -> list[RecordedFrame]:
-    colours, depths = (_stamped(folder / name) for name in ("rgb.txt", "depth.txt"))
-    poses = [(stamp, fields, number) for number, stamp, fields in _stamped_lines(trajectory)]
-    depth_times, pose_times = (np.array([row[0] for row in rows]) for rows in (depths, poses))
+    colours, depths = (_listed(folder / name) for name in ("rgb.txt", "depth.txt"))
+    poses = _stamped_lines(trajectory)
+    depth_times, pose_times = (np.array([row[1] for row in rows]) for rows in (depths, poses))
     frames = []
-    for stamp, name in colours:
+    for _, stamp, (name, *_) in colours:
         depth, pose = _nearest(depth_times, stamp), _nearest(pose_times, stamp)
         if depth is not None and pose is not None:
-            _, fields, number = poses[pose]
+            number, _, fields = poses[pose]
             matrix = _from_quaternion(trajectory, number, fields)
-            frames.append(RecordedFrame(folder / name, folder / depths[depth][1], matrix))
+            frames.append(RecordedFrame(folder / name, folder / depths[depth][2][0], matrix))
     if not frames:
         raise UserError(
             f"{folder}: no colour image of rgb.txt has a depth image and a pose within "
@@ -201,14 +197,15 @@ def _nearest(times: np.ndarray, stamp: float) -> int | None:
     return index if abs(times[index] - stamp) <= TUM_TOLERANCE_S else None
 
 
-def _stamped(path: Path) -> list[tuple[float, str]]:
+def _listed(path: Path) -> list[tuple[int, float, list[str]]]:
+    """Return the lines of a list of images: number, time stamp, and name first of the rest."""
     if not path.is_file():
         raise UserError(f"{path} does not exist; a TUM recording lists its images there.")
     rows = _stamped_lines(path)
     for number, _, fields in rows:
         if not fields:
             raise UserError(f"{path}, line {number}: a time stamp without a file name.")
-    return [(stamp, fields[0]) for _, stamp, fields in rows]
+    return rows
 
 
 def _stamped_lines(path: Path) -> list[tuple[int, float, list[str]]]:
@@ -252,8 +249,6 @@ def _floats(path: Path, line: int, fields: list[str], count: int) -> np.ndarray:
 
 FOLDER, TABLE = "voxels", "classes.json"
 FIELDS = ("classes", "origin", "cell")
-_UNREADABLE = (EOFError, KeyError, OSError, ValueError, zipfile.BadZipFile, zlib.error)
-"""Errors that NumPy raises for files that are not ``.npz``, are truncated, or hold pickles."""
 
 
 def read_voxels(
@@ -354,7 +349,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             classes, origin, cell = (np.asarray(file[field]) for field in FIELDS)
-    except _UNREADABLE as error:
+    except (OSError, *DAMAGED) as error:
         raise UserError(
             f"{path} cannot be read as a grid ({' '.join(str(error).split())[:120]}): write the "
             f"arrays {', '.join(FIELDS)} with numpy.savez_compressed."

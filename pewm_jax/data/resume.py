@@ -15,19 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data.dataset import (
-    MANIFEST,
-    UNFINISHED,
-    Manifest,
-    Shard,
-    count_records,
-    describe_shard,
-    read_manifest,
-    read_record,
-    write_json,
-    write_manifest,
-    write_shard,
-)
+from pewm_jax.data import dataset
 from pewm_jax.data.episodes import read_episode
 
 
@@ -52,17 +40,17 @@ class SplitProgress:
     settings: Mapping[str, Any]
     wanted: Mapping[Path, range]
     overwrite: bool = False
-    done: dict[str, Shard] = dataclasses.field(default_factory=dict)
+    done: dict[str, dataset.Shard] = dataclasses.field(default_factory=dict)
     state: Literal["fresh", "resume", "complete"] = dataclasses.field(init=False)
 
     def __post_init__(self):
         """Examine the folder; change nothing."""
-        finished = (self.folder / MANIFEST).is_file()
+        finished = (self.folder / dataset.MANIFEST).is_file()
         self.state = "fresh"
         if finished:
-            found = read_manifest(self.folder, check_files=False).settings
-        elif (self.folder / UNFINISHED).is_file():
-            found = _read_settings(self.folder / UNFINISHED)
+            found = dataset.read_manifest(self.folder, check_files=False).settings
+        elif (self.folder / dataset.UNFINISHED).is_file():
+            found = _read_settings(self.folder / dataset.UNFINISHED)
         else:
             return
         now = self.settings
@@ -78,7 +66,7 @@ class SplitProgress:
             self.state = "resume"
             if finished:
                 with contextlib.suppress(UserError):  # for a missing or truncated shard
-                    read_manifest(self.folder)
+                    dataset.read_manifest(self.folder)
                     self.state = "complete"
 
     def prepare(self) -> None:
@@ -86,13 +74,13 @@ class SplitProgress:
         folder, resumed = self.folder, self.state == "resume"
         folder.mkdir(parents=True, exist_ok=True)
         listed = {}
-        if resumed and (folder / MANIFEST).is_file():
-            manifest = read_manifest(folder, check_files=False)
+        if resumed and (folder / dataset.MANIFEST).is_file():
+            manifest = dataset.read_manifest(folder, check_files=False)
             listed = {shard.file: shard for shard in manifest.shards}
         if self.state == "fresh":
-            (folder / MANIFEST).unlink(missing_ok=True)
-        write_json(folder / UNFINISHED, dict(self.settings))
-        (folder / MANIFEST).unlink(missing_ok=True)
+            (folder / dataset.MANIFEST).unlink(missing_ok=True)
+        dataset.write_json(folder / dataset.UNFINISHED, dict(self.settings))
+        (folder / dataset.MANIFEST).unlink(missing_ok=True)
         for path, indices in self.wanted.items() if resumed else ():
             shard = _complete_shard(path, len(indices))
             if shard is not None and listed.get(shard.file, shard) == shard:
@@ -107,7 +95,7 @@ class SplitProgress:
 
     def write(self, path: Path, records: Iterable[bytes]) -> None:
         """Write a missing file."""
-        self.done[path.name] = write_shard(path, records)
+        self.done[path.name] = dataset.write_shard(path, records)
 
     def publish(self, frames: int | None = None) -> None:
         """Write ``dataset.json``, which marks the split as finished.
@@ -118,12 +106,14 @@ class SplitProgress:
         shards = tuple(self.done[path.name] for path in self.wanted)
         if frames is None:  # episodes may differ in length
             frames = sum(
-                read_episode(read_record(self.folder / shard.file, k)).length
+                read_episode(dataset.read_record(self.folder / shard.file, k)).length
                 for shard in shards
                 for k in range(shard.records)
             )
-        write_manifest(self.folder, Manifest(self.folder.name, shards, self.settings, frames))
-        (self.folder / UNFINISHED).unlink(missing_ok=True)
+        dataset.write_manifest(
+            self.folder, dataset.Manifest(self.folder.name, shards, self.settings, frames)
+        )
+        (self.folder / dataset.UNFINISHED).unlink(missing_ok=True)
 
 
 def unfinished_splits(
@@ -163,14 +153,12 @@ def unfinished_splits(
     return [split for split in found if split.state != "complete"]
 
 
-def _complete_shard(path: Path, records: int) -> Shard | None:
+def _complete_shard(path: Path, records: int) -> dataset.Shard | None:
     """Return the description of a shard, None if it is missing or incomplete."""
-    if not path.is_file():
-        return None
-    try:
-        return describe_shard(path) if count_records(path) == records else None
-    except UserError:
-        return None
+    with contextlib.suppress(UserError, FileNotFoundError):
+        shard = dataset.describe_shard(path)
+        return shard if shard.records == records else None
+    return None
 
 
 def _read_settings(path: Path) -> Mapping[str, Any]:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import struct
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,22 +24,6 @@ from pewm_jax.houses.generate import generate_house
 
 if TYPE_CHECKING:
     from embreex.rtcore_scene import EmbreeScene
-
-_UNREADABLE = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    ImportError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    struct.error,
-    zlib.error,
-)
-"""Errors that trimesh's parsers raise for files that they cannot read."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -112,11 +94,12 @@ def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
         raise UserError(f"{path} is not a file: give the path of a mesh (GLB, OBJ, PLY, …).")
     try:
         loaded = trimesh.load_scene(path)
-    except _UNREADABLE as error:
+    except Exception as error:  # trimesh's parsers raise many kinds for files they cannot read
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise UserError(
-            f"{path} could not be read as a mesh ({_one_line(error)}): check that the file is "
-            "complete and of a kind that trimesh loads (GLB, OBJ, PLY, …)."
-        ) from None
+            f"{path} could not be read as a mesh ({reason}): check that the file is complete and "
+            "of a kind that trimesh loads (GLB, OBJ, PLY, …)."
+        ) from error
     if up == "auto":
         up = "y" if path.suffix.lower() in {".glb", ".gltf"} else "z"
     return from_trimesh(loaded, path.stem, up, where=str(path))
@@ -250,16 +233,10 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
 def _albedo(parts: list[_Part]) -> np.ndarray:
     """Return (F, 3) float32 mean colours of faces; for an image, the mean of the whole image."""
     found = []
-    for part in parts:
-        image = part.surface.image
-        whole = 1.0 if image is None else image.mean((0, 1)) / 255
-        found.append(part.surface.colour_F33.mean(1) * whole)
+    for surface in (part.surface for part in parts):
+        whole = 1.0 if surface.image is None else surface.image.mean((0, 1)) / 255
+        found.append(surface.colour_F33.mean(1) * whole)
     return np.concatenate(found).astype(np.float32)
-
-
-def _one_line(error: BaseException) -> str:
-    """Return an exception as a short single line."""
-    return " ".join(str(error).split())[:160] or type(error).__name__
 
 
 GREY = np.array([170, 170, 170], np.uint8)

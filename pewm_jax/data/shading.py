@@ -141,10 +141,7 @@ def require_embree() -> None:
 
 
 def embree(vertices_V3: np.ndarray, faces_F3: np.ndarray) -> EmbreeScene:
-    """Build Embree's acceleration structure over a triangle mesh.
-
-    UserError if it is not installed.
-    """
+    """Build Embree's structure over a triangle mesh; UserError if it is not installed."""
     require_embree()
     from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415
     from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415

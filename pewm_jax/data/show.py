@@ -17,6 +17,7 @@ from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.voxels import VoxelFrames, table_colours
+from pewm_jax.geometry.cameras import measured_points
 from pewm_jax.geometry.march import through_pixels
 from pewm_jax.io import atomic
 from pewm_jax.types import Camera, Frames
@@ -63,11 +64,7 @@ class ShowConfig:
 
 
 def show(config: ShowConfig, log: Callable[[str], None] = print) -> None:
-    """Draw an episode and write the image.
-
-    Raises:
-        UserError: the split cannot be read, or has no such episode.
-    """
+    """Draw an episode and write the image; UserError if there is no such episode."""
     source = EpisodeSource(config.path)
     if not 0 <= config.episode < len(source):
         raise UserError(
@@ -79,8 +76,7 @@ def show(config: ShowConfig, log: Callable[[str], None] = print) -> None:
     config.out.parent.mkdir(parents=True, exist_ok=True)
     done, code = cv2.imencode(".png", picture[..., ::-1])
     assert done
-    with atomic.replacing(config.out) as partial:
-        partial.write_bytes(code.tobytes())
+    atomic.write_bytes(config.out, code.tobytes())
     log(f"{config.out}: {episode.name} in {episode.scene}, {episode.length} frames.")
 
 
@@ -202,16 +198,12 @@ def _points(episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     """Return points in the world (N, 3) below the ceiling, and their colours (N, 3)."""
     frames = episode.frames(np.unique(np.linspace(0, episode.length - 1, 60).astype(int)))
     step = max(1, episode.height // 64)
-    fx, fy, cx, cy = np.asarray(episode.intrinsics_4, np.float64)
-    v, u = np.mgrid[0 : episode.height : step, 0 : episode.width : step]
-    rays = np.stack([(u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, np.ones(u.shape)], -1)
     points, colours = [], []
-    for k, pose in enumerate(np.asarray(frames.camera.world_from_camera, np.float64)):
-        depth = frames.depth_THW[k][v, u]
-        world = (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
-        kept = (depth > 0) & (world[..., 2] < pose[2, 3] + CEILING_M)
-        points.append(world[kept])
-        colours.append(frames.rgb_THWC[k][v, u][kept])
+    for k, pose in enumerate(np.asarray(frames.camera.world_from_camera)):
+        world, (v, u) = measured_points(frames.depth_THW[k], episode.intrinsics_4, pose, step)
+        low = world[:, 2] < float(pose[2, 3]) + CEILING_M
+        points.append(world[low])
+        colours.append(frames.rgb_THWC[k][v, u][low])
     return np.concatenate(points), np.concatenate(colours)
 
 

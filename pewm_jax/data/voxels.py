@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.record_format import DamagedError
+from pewm_jax.geometry.cameras import measured_points
 from pewm_jax.houses.kinds import GROUPS, KINDS
 from pewm_jax.types import Camera
 
@@ -340,15 +341,10 @@ def disagreement(
     and the cells around it are empty. None if at most ``MOST_FLOATING`` of the points of all frames
     float.
     """
-    frames, height, width = depth_THW.shape
-    rows, columns = np.mgrid[0:height:STEP, 0:width:STEP]
-    lost, seen = np.zeros(frames), np.zeros(frames)
-    for t in range(frames):
-        depth = np.asarray(depth_THW[t, rows, columns], np.float64)
-        fx, fy, cx, cy = np.asarray(camera.intrinsics_4[t], np.float64)
-        ray = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones_like(depth)], -1)
-        pose = np.asarray(camera.world_from_camera[t], np.float64)
-        points = (ray * depth[..., None])[depth > 0] @ pose[:3, :3].T + pose[:3, 3]
+    lost, seen = np.zeros(len(depth_THW)), np.zeros(len(depth_THW))
+    for t, depth_HW in enumerate(depth_THW):
+        pose = camera.world_from_camera[t]
+        points, _ = measured_points(depth_HW, camera.intrinsics_4[t], pose, STEP)
         grid = voxels.classes_TXYZ[t]
         near = np.asarray(ndimage.binary_dilation(grid > 0, np.ones((3, 3, 3))))
         cell = np.floor((points - voxels.origin_T3[t]) / voxels.cell_m).astype(int)

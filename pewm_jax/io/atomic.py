@@ -41,6 +41,14 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text, "utf-8")
 
 
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically, and flush it to disk."""
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
 def remove(path: Path) -> None:
     """Remove a file or a folder with its contents, if it exists."""
     if path.is_dir() and not path.is_symlink():

@@ -101,10 +101,7 @@ class Network:
         return jax.eval_shape(lambda key: self.init(config, key), jax.random.key(0))
 
     def config(self, values: dict[str, Any], where: str) -> Any:
-        """Read the published settings.
-
-        A UserError for unsupported ones names the file ``where``.
-        """
+        """Read the published settings; UserError, which names ``where``, for unsupported ones."""
         try:
             return self.read_config(values)
         except UserError as error:

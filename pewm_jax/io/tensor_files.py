@@ -210,7 +210,9 @@ def _open(path: Path) -> Iterator[Any]:
 
 def _places(path: Path, file: Any) -> dict[str, Place]:
     """Return the locations in an opened file; the library has checked that there are no gaps."""
-    begin, text = _header(path)
+    with path.open("rb") as raw:
+        (length,) = struct.unpack("<Q", raw.read(8))
+        begin, text = 8 + length, raw.read(length)
     facts = file.metadata() or {}
     digests = json.loads(facts[_TENSORS]) if _has_checksums(path, facts, text) else {}
     found = {}
@@ -226,13 +228,6 @@ def _places(path: Path, file: Any) -> dict[str, Place]:
         found[name] = place
         begin += place.size
     return found
-
-
-def _header(path: Path) -> tuple[int, bytes]:
-    """Return the offset at which the tensors begin, and the header's bytes."""
-    with path.open("rb") as file:
-        (length,) = struct.unpack("<Q", file.read(8))
-        return 8 + length, file.read(length)
 
 
 def _has_checksums(path: Path, facts: Mapping[str, str], text: bytes) -> bool:

@@ -34,11 +34,7 @@ def flatten(tree: Any) -> dict[str, Any]:
 
 
 def unflatten(leaves: Mapping[str, Any]) -> Params:
-    """Convert ``{path: leaf}`` to nested dictionaries; the inverse of ``flatten``.
-
-    Raises:
-        TreeError: a path is both a leaf and a branch.
-    """
+    """Convert ``{path: leaf}`` to nested dictionaries; TreeError if a leaf has leaves."""
     tree: Params = {}
     for path, leaf in leaves.items():
         *branch, name = path.split("/")
@@ -111,11 +107,7 @@ def exclude(tree: Params, patterns: Sequence[str]) -> Params:
 
 
 def merge(*trees: Params) -> Params:
-    """Join nested dictionaries that have no leaf in common; the inverse of ``split``.
-
-    Raises:
-        TreeError: a leaf occurs in more than one tree.
-    """
+    """Join nested dictionaries; TreeError if they share a leaf. The inverse of ``split``."""
     leaves: dict[str, Any] = {}
     for tree in trees:
         more = flatten(tree)

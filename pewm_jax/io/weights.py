@@ -85,18 +85,8 @@ def verify(path: Path) -> None:
         pass
 
 
-def check(params: Params, like: Params, where: str) -> None:
-    """Raise an error if parameters do not have the expected paths and shapes.
-
-    Args:
-        params: the loaded parameters.
-        like: arrays, or abstract arrays (``jax.eval_shape``), with the expected paths and shapes.
-        where: the file, for the message.
-
-    Raises:
-        TreeError: they differ; lists the differences.
-    """
-    tree.require_like(params, like, where)
+check = tree.require_like
+"""Raise TreeError if parameters do not have the paths and shapes of a tree."""
 
 
 def metadata(path: Path) -> dict[str, str]:
