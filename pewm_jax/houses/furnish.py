@@ -7,8 +7,6 @@ of the room.
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 
 from pewm_jax.houses import fixtures, furniture
@@ -67,21 +65,13 @@ TRIES = 12
 """Random positions tried for a piece before it is skipped."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Placed:
-    """A piece of furniture and its pose ``world_from_piece`` (4, 4)."""
-
-    piece: Piece
-    world_from_piece: np.ndarray
-
-
 class Furnisher:
     """Places furniture in one room and tracks which walls and floor cells are occupied."""
 
     def __init__(self, room: Room, rng: np.random.Generator, palette: Palette, height: float):
         """Start with the bare room."""
         self.room, self.rng, self.palette, self.height = room, rng, palette, height
-        self.placed: list[Placed] = []
+        self.placed: list[tuple[Piece, np.ndarray]] = []
         self.footprints: list[Rect] = []
         self._last = (0, 0.0, 0.0)  # side, place along it and width of the last piece at a wall
         self.used: list[list[Rect]] = [[] for _ in range(4)]
@@ -103,8 +93,11 @@ class Furnisher:
         maker = getattr(furniture, kind, None) or getattr(fixtures, kind)
         return maker(self.rng, self.palette)
 
-    def furnish(self) -> list[Placed]:
-        """Place the furniture that belongs to the room's use, then decorate."""
+    def furnish(self) -> list[tuple[Piece, np.ndarray]]:
+        """Place the furniture that belongs to the room's use, then decorate.
+
+        Return pieces and poses.
+        """
         rng, use = self.rng, self.room.use
         required, optional = FURNITURE[use]
         for kind in required:
@@ -138,7 +131,7 @@ class Furnisher:
         x0, y0, x1, y1 = self.room.rect
         pose = shift((x0 + x1) / 2, (y0 + y1) / 2)
         pose[2, 3] = self.height
-        self.placed.append(Placed(self.make("ceiling_lamp"), pose))
+        self.placed.append((self.make("ceiling_lamp"), pose))
 
     def at_wall(self, piece: Piece) -> bool:
         """Put a piece with its back to a random wall; return whether a position was found."""
@@ -209,7 +202,7 @@ class Furnisher:
         if x1 - x0 > w + 0.4 and y1 - y0 > d + 0.4:
             middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2]) + self.rng.uniform(-0.15, 0.15, 2)
             pose = turned(turn, middle) @ shift(0, -piece.size[1] / 2)
-            self.placed.append(Placed(piece, pose))
+            self.placed.append((piece, pose))
 
     def hang(self, piece: Piece, bottom: float) -> None:
         """Hang a piece on a free stretch of wall."""
@@ -229,7 +222,7 @@ class Furnisher:
             if depth < 0.1 or self._accept(rect, over_others=True):
                 pose = wall_frame(self.room, side, at)
                 pose[2, 3] = bottom
-                self.placed.append(Placed(piece, pose))
+                self.placed.append((piece, pose))
                 self.used[side].append(span)
                 return
 
@@ -241,7 +234,7 @@ class Furnisher:
             return False
         if not self._accept(against(self.room, side, at, depth, width)):
             return False
-        self.placed.append(Placed(piece, wall_frame(self.room, side, at)))
+        self.placed.append((piece, wall_frame(self.room, side, at)))
         self.used[side].append(span)
         self._last = (side, at, width)
         return True
@@ -254,7 +247,7 @@ class Furnisher:
         inside = left > x0 and near > y0 and right < x1 and far < y1
         if not inside or not self._accept((left, near, right, far), margin):
             return False
-        self.placed.append(Placed(piece, pose))
+        self.placed.append((piece, pose))
         return True
 
     def _accept(self, rect: Rect, margin: float = 0.0, *, over_others: bool = False) -> bool:

@@ -77,9 +77,8 @@ def _draw(rng: np.random.Generator) -> trimesh.Scene | None:
     scene = trimesh.Scene()
     for index, (room, palette) in enumerate(zip(plan.rooms, palettes, strict=True)):
         _add_shell(scene, rng, room, f"room{index}-{room.use}", palette, plan.height)
-        for number, placed in enumerate(furniture[index]):
-            name = f"room{index}-{placed.piece.kind}-{number}"
-            _add_piece(scene, name, placed.piece, placed.world_from_piece)
+        for number, (piece, pose) in enumerate(furniture[index]):
+            _add_piece(scene, f"room{index}-{piece.kind}-{number}", piece, pose)
     for index, (a, _, rect) in enumerate(plan.doorways):
         _add_piece(scene, f"doorway{index}", doorway_piece(rect, DOOR_TOP_M, palettes[a]))
     scene.metadata.update(
