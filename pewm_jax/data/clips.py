@@ -126,15 +126,9 @@ def cut(
 def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
     """Return the (T − 1, A) float32 actions that lead from each frame of a clip to the next.
 
-    Args:
-        actions_TA: (episode's frames − 1, A), action k leads from frame k to frame k + 1 of the
-            episode.
-        frames_T: (T,) evenly spaced frames of the episode.
-
-    Returns:
-        The actions between two frames of the clip become one: the motions of planar actions (A = 3)
-            are
-        composed; actions of other kinds are concatenated, (T − 1, stride · A).
+    Action k leads from frame k to frame k + 1 of the episode; the clip's frames are evenly spaced.
+    The actions between two of them become one: the motions of planar actions (A = 3) are composed;
+    actions of other kinds are concatenated, (T − 1, stride · A).
     """
     stride = int(frames_T[1] - frames_T[0]) if len(frames_T) > 1 else 1
     steps_TSA = actions_TA[frames_T[:-1, None] + np.arange(stride)]

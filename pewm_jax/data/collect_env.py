@@ -127,14 +127,7 @@ def make(
     split: str,
     index: int,
 ) -> bytes:
-    """Run one episode and return its record.
-
-    Args:
-        env: from ``open_env``.
-        policy: from ``open_policy``.
-        config: the settings.
-        split: the episode's split.
-        index: the episode's number in the split.
+    """Run one episode, number ``index`` of a split, and return its record.
 
     Raises:
         UserError: the environment does not provide the arrays needed or ends its episodes too soon,
@@ -322,9 +315,8 @@ def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) ->
     """Create a dataset from an environment, or its missing shards; ``log`` prints lines.
 
     Raises:
-        UserError: the environment or the policy cannot be opened, the environment does not provide
-            the required arrays, its episodes are too short or fail validation, or the output folder
-            contains a dataset with other settings.
+        UserError: as ``open_env``, ``open_policy`` and ``make``, or the output folder contains a
+            dataset with other settings.
     """
     splits = resume.unfinished_splits(
         config.out,

@@ -181,14 +181,9 @@ def dataset(
 
 
 def records(config: Config, split: str = "train", *, seed: int, batch: int, step: int) -> list[str]:
-    """Name the clips of a batch, recomputed from its number; arguments as for ``clips``.
+    """Name the clips of batch ``step``, recomputed from its number; arguments as for ``clips``.
 
-    Args:
-        config: as for ``clips``.
-        split: folder inside ``data.path``.
-        seed: as for ``clips``.
-        batch: clips per batch.
-        step: number of the batch, from 0; training uses it in step ``step + 1``.
+    Batches count from 0; training uses batch k in step k + 1.
 
     Returns:
         B names such as ``train/shard-00000-of-00004.array_record record 12 (episode house-3/follow)

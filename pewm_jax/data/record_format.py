@@ -90,11 +90,8 @@ def pack_record(
 ) -> bytes:
     """Concatenate header, arrays and images; offsets count from the end of the header.
 
-    Args:
-        header: without ``arrays`` and ``streams``, which are filled in.
-        arrays: the arrays by field.
-        streams: the encoded images, or grids, of each frame, by stream.
-        about: header entries of the streams that are not PNG images.
+    ``arrays`` and ``streams`` of the header are filled in. A stream has the encoded images, or
+    grids, of each frame; ``about`` has header entries of the streams that are not PNG images.
     """
     blobs: list[bytes] = []
     offset = 0

@@ -254,15 +254,10 @@ FIELDS = ("classes", "origin", "cell")
 def read_voxels(
     recording: Path, colours: Sequence[Path], world_from_recording: np.ndarray
 ) -> VoxelFrames | None:
-    """Read the grids of a recording's frames, rotated with its world.
+    """Read the grids of a recording's frames, given their colour images, rotated with its world.
 
-    Args:
-        recording: the folder.
-        colours: the colour images of the frames.
-        world_from_recording: (4, 4) rotation by right angles from the recording's axes to ours.
-
-    Returns:
-        The grids, or None if there is no folder ``voxels/``.
+    ``world_from_recording`` is a (4, 4) rotation by right angles from the recording's axes to ours.
+    None if there is no folder ``voxels/``.
 
     Raises:
         UserError: a frame's file is missing or cannot be read, the grids have different sides or
@@ -305,16 +300,11 @@ def read_voxels(
 def turned(
     classes_XYZ: np.ndarray, origin_3: np.ndarray, cell_m: float, rotation_33: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate a grid about the world's origin by right angles.
+    """Rotate a grid (n, n, n) about the world's origin by right angles.
 
-    Args:
-        classes_XYZ: (n, n, n) the cells.
-        origin_3: lowest corner of the grid, metres.
-        cell_m: side of a cell, metres.
-        rotation_33: a signed permutation of the axes, from the old to the new.
-
-    Returns:
-        The cells along the new axes, and the grid's lowest corner.
+    ``origin_3`` is its lowest corner, ``cell_m`` the side of a cell, metres; the rotation is a
+    signed permutation of the axes, from the old to the new. Return the cells along the new axes,
+    and the grid's lowest corner.
     """
     exact = np.rint(rotation_33).astype(int)
     order = np.abs(exact).argmax(1)  # new axis k is old axis order[k]

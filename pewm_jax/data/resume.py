@@ -134,8 +134,7 @@ def unfinished_splits(
         overwrite: replace splits that were made with other settings.
 
     Raises:
-        ConfigError: a split was made with other settings.
-        UserError: ``out`` is a file, or a split's files cannot be read.
+        UserError: ``out`` is a file, or as for ``SplitProgress``.
     """
     if out.exists() and not out.is_dir():
         raise UserError(f"{out} is a file; give a folder to write the dataset to.")

@@ -81,10 +81,8 @@ def house(seed: int) -> Scene:
 def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
     """Read a mesh file of any kind that trimesh loads (GLB, OBJ, PLY, STL, …).
 
-    Args:
-        path: the file.
-        up: which axis of the file points up; ``auto`` is y for glTF, as in its specification, and z
-            for all others.
+    ``up`` is the axis of the file that points up; ``auto`` is y for glTF, as in its specification,
+    and z for all others.
 
     Raises:
         UserError: the file is absent or unreadable, or holds no usable triangles.
@@ -112,17 +110,13 @@ def from_trimesh(
     *,
     where: str | None = None,
 ) -> Scene:
-    """Convert a trimesh scene, with its instances, textures and colours, to a `Scene`.
+    """Convert a trimesh scene in metres, with its instances, textures and colours, to a `Scene`.
 
     Meshes of one colour (grey if they have none) are shaded by the direction of each face. Textures
     and vertex colours are kept as they are, because scans contain their own light. A scene whose
-    metadata says ``shading: soft`` gets light and ambient occlusion baked everywhere.
-
-    Args:
-        scene: meshes in metres; entries that are not triangle meshes are left out.
-        name: name of the result.
-        up: axis that points up; y is turned to z.
-        where: name of the scene in error messages; ``name`` by default.
+    metadata says ``shading: soft`` gets light and ambient occlusion baked everywhere. Entries that
+    are not triangle meshes are left out. If y points up, it is turned to z. Errors name the scene
+    by ``where``, or by its name.
 
     Raises:
         UserError: there are no triangles, or vertices are not finite.

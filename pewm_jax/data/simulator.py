@@ -72,16 +72,11 @@ def open_simulator(
     hfov: float = 90.0,
     camera_height: float = 1.25,
 ) -> Simulator:
-    """Open a mesh, or the generated house of a seed.
+    """Open a mesh file in metres, or the generated house of a seed.
 
-    Args:
-        house_seed: seed of the house, used without a mesh.
-        scene: a mesh (GLB, OBJ, PLY, …) in metres.
-        up: which axis of the mesh points up; ``auto``: y for GLB and glTF, z for the others.
-        height: image height in pixels.
-        width: image width in pixels.
-        hfov: horizontal field of view, degrees.
-        camera_height: height of the camera above the floor, metres.
+    ``up`` is the axis of the mesh that points up; ``auto``: y for GLB and glTF, z for the others.
+    Sizes of images are in pixels, the field of view in degrees, the camera's height above the floor
+    in metres.
 
     Raises:
         UserError: there is no renderer, or a mesh does not load or has no free floor.
@@ -108,12 +103,11 @@ def move(
     Args:
         grid: the cells where the agent can stand.
         planar_3: x, y, yaw; x and y lie in a free cell.
-        action_3: dx, dy, dyaw: metres forward, metres left, radians counter-clockwise.
+        action_3: metres forward, metres left, radians counter-clockwise.
         sliding: whether the agent slides along obstacles.
 
     Returns:
-        ``(planar_3, collided)``: the next pose, yaw in (−π, π], in a free cell; and whether the
-        straight line was blocked.
+        The next pose, yaw in (−π, π], in a free cell; and whether the straight line was blocked.
     """
     planar = np.asarray(planar_3, np.float64)
     after = advance(planar, np.asarray(action_3, np.float64))

@@ -154,8 +154,7 @@ def make_trajectory(
         frames: number of frames T; T − 1 actions are made.
         rng: source of all randomness.
         policy: ``follow`` walks shortest paths between far goals, ``walk`` goes straight up to
-            obstacles, ``revisit`` turns around, goes out to a far goal and comes back through the
-            same positions.
+            obstacles, ``revisit`` turns, goes to a far goal and comes back over the same positions.
         turn_around: probability of a full turn at the start (``revisit`` always makes it).
         continuous: small (dx, dy, dyaw) instead of the three discrete actions.
 

@@ -232,15 +232,10 @@ def record_voxels(
     moving: MovingHouse | None = None,
     poses_TP44: np.ndarray | None = None,
 ) -> VoxelFrames:
-    """Return the grids around an agent at T frames.
+    """Return the grids around an agent, whose camera is at (T, 3) metres, at T frames.
 
-    Args:
-        config: cell, side and classes.
-        scene: the static scene.
-        floor_z: height of the floor, which becomes a border of cells, metres.
-        centre_T3: positions of the agent's camera, metres.
-        moving: the house with moving parts, if there are any.
-        poses_TP44: poses of these parts, from ``MovingHouse.poses``.
+    The floor at ``floor_z`` becomes a border of cells. Moving parts have the poses of
+    ``MovingHouse.poses``.
     """
     lattice = _lattice(config, scene, floor_z)
     moved: list[FilledCells] | None = None

@@ -54,12 +54,10 @@ def resize_intrinsics(intrinsics_4: Array, scale_x: float, scale_y: float) -> Ar
 
 
 def pose_from_yaw(position_3: np.ndarray, yaw: float, pitch: float = 0.0) -> np.ndarray:
-    """Return the (4, 4) ``world_from_camera`` of an upright camera.
+    """Return the (4, 4) ``world_from_camera`` of an upright camera at a position, metres.
 
-    Args:
-        position_3: camera centre in the world, metres.
-        yaw: heading, radians, counter-clockwise from above; 0 looks along world +x.
-        pitch: radians, positive looks up.
+    The yaw is counter-clockwise from above, 0 looks along world +x; positive pitch looks up;
+    radians.
 
     Raises:
         UserError: an argument is not a number, or the position does not have shape (3,).

@@ -191,12 +191,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_config(path: Path, classes: Sequence[str], key: str = "_class_name") -> dict[str, Any]:
-    """Read the settings of a network.
+    """Read the settings in ``config.json``, ``scheduler_config.json`` or ``model_index.json``.
 
-    Args:
-        path: ``config.json``, ``scheduler_config.json`` or ``model_index.json``.
-        classes: the supported class names.
-        key: the setting that names the class.
+    The setting ``key`` names the class.
 
     Raises:
         UserError: the file cannot be read or names another class.
