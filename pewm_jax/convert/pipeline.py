@@ -60,7 +60,7 @@ def read(network: Network, folder: str | Path, dtype: str | None = None) -> tupl
             class or setting is unknown.
     """
     config, files = _open(network, Path(folder))
-    total = sum(place.size for _, place in files.places.values())
+    total = tensor_files.size(files.tensors)
     with output.megabytes(f"read {network.folder}", total) as progress:
         source = _used(network, files)
         like = network.like(config)

@@ -19,9 +19,8 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
-from pewm_jax.data.voxels import LOOKS, disagreement, off_lattice, outside
+from pewm_jax.data.voxels import LOOKS, disagreement, measured_points, off_lattice, outside
 from pewm_jax.geometry.actions import PLANAR
-from pewm_jax.geometry.cameras import measured_points
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
 """Plausible median depths, metres; a recording outside this range has a wrong unit."""

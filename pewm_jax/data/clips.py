@@ -157,8 +157,11 @@ def stack(clips: Sequence[Clip]) -> Clip:
     names = dict.fromkeys(name for clip in clips for name in clip.extras)
     found = {name: optional(name, [clip.extras.get(name) for clip in clips]) for name in names}
     required = [(clip.frames, clip.context, clip.context_valid_S) for clip in clips]
+    stacked, context, valid = jax.tree.map(lambda *parts: np.stack(parts), *required)
     return Clip(
-        *jax.tree.map(lambda *parts: np.stack(parts), *required),
+        stacked,
+        context,
+        valid,
         optional("actions_TA", [clip.actions_TA for clip in clips]),
         {k: v for k, v in found.items() if v is not None},
     )

@@ -57,7 +57,7 @@ class NavGrid:
     @property
     def centres(self) -> np.ndarray:
         """World centres (Y, X, 2) of all cells."""
-        return self.centre_of(np.stack(np.indices(self.free_YX.shape), -1))
+        return self.centre_of(np.moveaxis(np.indices(self.free_YX.shape), 0, -1))
 
 
 def navigable(

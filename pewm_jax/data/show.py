@@ -16,8 +16,7 @@ import tyro
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.voxels import VoxelFrames, table_colours
-from pewm_jax.geometry.cameras import measured_points
+from pewm_jax.data.voxels import VoxelFrames, measured_points, table_colours
 from pewm_jax.geometry.march import through_pixels
 from pewm_jax.io import atomic
 from pewm_jax.types import Camera, Frames

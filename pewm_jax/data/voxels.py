@@ -20,7 +20,6 @@ from scipy import ndimage
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.record_format import DamagedError
-from pewm_jax.geometry.cameras import measured_points
 from pewm_jax.houses.kinds import GROUPS, KINDS
 from pewm_jax.types import Camera
 
@@ -330,6 +329,23 @@ def outside(origin_T3: np.ndarray, grid: VoxelGrid, place_T3: np.ndarray) -> lis
     """Return the frames in which a position (T, 3) does not lie in the grid."""
     at = (np.asarray(place_T3, np.float64) - origin_T3) / (grid.cell_m * grid.side)
     return np.flatnonzero(((at < 0) | (at > 1)).any(-1)).tolist()
+
+
+def measured_points(
+    depth_HW: np.ndarray, intrinsics_4: np.ndarray, world_from_camera: np.ndarray, step: int = 1
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return the world points (N, 3) of measured pixels, and their rows and columns.
+
+    In float64 on the host; of the rows and of the columns every ``step``-th is used.
+    """
+    v, u = np.mgrid[0 : depth_HW.shape[0] : step, 0 : depth_HW.shape[1] : step]
+    seen = depth_HW[v, u] > 0
+    u, v = u[seen], v[seen]
+    z = depth_HW[v, u].astype(np.float64)
+    fx, fy, cx, cy = np.asarray(intrinsics_4, np.float64)
+    pose = np.asarray(world_from_camera, np.float64)
+    points = np.stack([(u + 0.5 - cx) / fx * z, (v + 0.5 - cy) / fy * z, z], -1)
+    return points @ pose[:3, :3].T + pose[:3, 3], (v, u)
 
 
 def disagreement(

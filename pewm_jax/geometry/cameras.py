@@ -121,23 +121,6 @@ def unproject(depth_HW: Array, camera: Camera) -> Array:
     return transform_points(camera.world_from_camera, flat).reshape(points.shape)
 
 
-def measured_points(
-    depth_HW: np.ndarray, intrinsics_4: np.ndarray, world_from_camera: np.ndarray, step: int = 1
-) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
-    """Return the world points (N, 3) of measured pixels, and their rows and columns.
-
-    In float64 on the host; of the rows and of the columns every ``step``-th is used.
-    """
-    v, u = np.mgrid[0 : depth_HW.shape[0] : step, 0 : depth_HW.shape[1] : step]
-    seen = depth_HW[v, u] > 0
-    u, v = u[seen], v[seen]
-    z = depth_HW[v, u].astype(np.float64)
-    fx, fy, cx, cy = np.asarray(intrinsics_4, np.float64)
-    pose = np.asarray(world_from_camera, np.float64)
-    points = np.stack([(u + 0.5 - cx) / fx * z, (v + 0.5 - cy) / fy * z, z], -1)
-    return points @ pose[:3, :3].T + pose[:3, 3], (v, u)
-
-
 def project(points_world_P3: Array, camera: Camera) -> tuple[Array, Array]:
     """Project world points (..., P, 3) into cameras (...); the leading shapes broadcast.
 

@@ -81,7 +81,7 @@ def march(
         jnp.pad(x, ((0, 0), (0, -rays % CHUNK)), "edge").reshape(3, -1, CHUNK).swapaxes(0, 1)
         for x in (start, way)
     ]
-    made = jax.lax.map(lambda part: _chunk(flat, shape, *part, layers), tuple(parts))
+    made = jax.lax.map(lambda part: _chunk(flat, shape, part[0], part[1], layers), tuple(parts))
     return jax.tree.map(lambda x: x.reshape(-1, layers)[:rays], made)
 
 

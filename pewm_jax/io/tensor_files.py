@@ -136,7 +136,7 @@ def _text(table: Mapping[str, object]) -> bytes:
     return text + b" " * (-len(text) % 8)
 
 
-def size(like: Mapping[str, Array | jax.ShapeDtypeStruct]) -> int:
+def size(like: Mapping[str, Any]) -> int:
     """Return the size in bytes of tensors, given anything with shape and dtype by name."""
     return sum(math.prod(x.shape) * np.dtype(x.dtype).itemsize for x in like.values())
 
