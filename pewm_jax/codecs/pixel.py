@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config.parts import Codec
 from pewm_jax.errors import require_positive
-from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.geometry.cameras import fold_frames
 from pewm_jax.types import Array, Params
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from pewm_jax.config.parts import Conditioner
-from pewm_jax.geometry.plucker import camera_latents
+from pewm_jax.geometry.cameras import camera_latents
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.types import Array, Camera, Control, Frames, Params
 

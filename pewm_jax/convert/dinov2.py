@@ -136,7 +136,7 @@ def _read_state_dict(path: Path) -> Source:
         isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in found.items()
     ):
         raise UserError(f"{path} is not a plain table of names and tensors, a state dict.")
-    return sources.Arrays({name: _to_numpy(torch, x) for name, x in found.items()}, str(path))
+    return sources.in_memory({name: _to_numpy(torch, x) for name, x in found.items()}, str(path))
 
 
 def _to_numpy(torch: Any, tensor: Any) -> np.ndarray:

@@ -24,7 +24,7 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.convert import output
 from pewm_jax.io import sources, tensor_files, tree
 from pewm_jax.io.published import Entry, Network
-from pewm_jax.io.sources import Renamed, Source
+from pewm_jax.io.sources import Source, renamed
 from pewm_jax.types import Array, Params
 
 WEIGHTS = "weights.safetensors"
@@ -60,7 +60,7 @@ def read(network: Network, folder: str | Path, dtype: str | None = None) -> tupl
             class or setting is unknown.
     """
     config, files = _open(network, Path(folder))
-    total = sum(place.size for _, place in files.places.values())
+    total = tensor_files.size(files.tensors)
     with output.megabytes(f"read {network.folder}", total) as progress:
         source = _used(network, files)
         like = network.like(config)
@@ -140,17 +140,17 @@ def write_published(
         tensor_files.write(path, announced, tensors, {"format": "pt"}, progress)
 
 
-def _open(network: Network, folder: Path) -> tuple[Any, sources.Files]:
+def _open(network: Network, folder: Path) -> tuple[Any, Source]:
     """Return the settings and the files of a network, without reading weights."""
     config = read_config(network, folder)
     return config, sources.open_folder(sources.component(folder, network.folder))
 
 
-def _used(network: Network, files: sources.Files) -> Source:
+def _used(network: Network, files: Source) -> Source:
     """Return the tensors, except those that no network uses."""
     if not network.unused:
         return files
-    return Renamed(files, {n: (n, 0, 1) for n in files.names() if n not in network.unused})
+    return renamed(files, {n: (n, 0, 1) for n in files.names() if n not in network.unused})
 
 
 def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:

@@ -27,11 +27,8 @@ def frames(*lead: int, height: int, width: int, colours: Any = np.uint8) -> Fram
 def clip(config: Config, batch: int, *, features: bool = False, actions: bool = True) -> Clip:
     """Return an abstract batch like those of the loader.
 
-    Args:
-        config: the experiment.
-        batch: number of clips.
-        features: whether it contains the context's cached features (``data.features``).
-        actions: whether actions were recorded.
+    ``features`` adds the context's cached features (``data.features``), ``actions`` recorded
+    actions.
     """
     size, asked = config.model.clip, config.model.batch_spec
     context = config.data.context if asked.context else 0

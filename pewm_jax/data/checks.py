@@ -13,13 +13,13 @@ poses 22 % and more.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
-from pewm_jax.data.voxels import LOOKS, disagreement, off_lattice, outside
+from pewm_jax.data.voxels import LOOKS, disagreement, measured_points, off_lattice, outside
 from pewm_jax.geometry.actions import PLANAR
 
 MEDIAN_DEPTH_M = (0.05, 40.0)
@@ -34,14 +34,7 @@ ACTION_M, ACTION_RAD = 2e-3, 2e-3
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """A problem of an episode.
-
-    Attributes:
-        where: file and record.
-        frame: number of the frame, None if all frames are affected.
-        field: name of the field.
-        what: the sentence that describes the problem.
-    """
+    """A problem of an episode: file and record, frame (None: all), field, sentence."""
 
     where: str
     frame: int | None
@@ -53,34 +46,41 @@ class Problem:
         return f"{self.where}{frame}, {self.field}: {self.what}"
 
 
+Found = Iterator[tuple[int | None, str]]
+"""Problems of one field: the number of the frame (None: all) and the sentence."""
+
+
 def check_episode(episode: Episode, where: str) -> list[Problem]:
-    """Return all problems of an episode; the cheap checks come first.
+    """Return all problems of an episode; the cheap checks come first. All images are decoded.
 
     Args:
-        episode: the episode to check; all its images are decoded.
+        episode: the episode to check.
         where: its file and record, for the messages.
     """
-    found = [
-        *_check_intrinsics(episode, where),
-        *_check_poses(episode, where),
-        *_check_actions(episode, where),
-    ]
+    found: list[Problem] = []
+
+    def add(field: str, problems: Iterable[tuple[int | None, str]]) -> None:
+        found.extend(Problem(where, frame, field, what) for frame, what in problems)
+
+    add("intrinsics", _check_intrinsics(episode))
+    add("world_from_camera", _check_poses(episode))
+    add("actions", _check_actions(episode))
     try:
         depth_THW = episode.frames().depth_THW
         if episode.has_ids:
             episode.ids()
     except UserError as error:
-        return [*found, Problem(where, None, "images", str(error))]
-    found += _check_voxels(episode, depth_THW, where)
-    found += _check_saturation(depth_THW, where) or check_depth(depth_THW, where)
-    if not found and not episode.info.get(
-        "moving"
-    ):  # wrong poses or units would only be reported again
-        found += _check_geometry(episode, depth_THW, where)
+        add("images", [(None, str(error))])
+        return found
+    add("voxels", _check_voxels(episode, depth_THW))
+    add("depth", [*_check_saturation(depth_THW)] or _check_units(depth_THW))
+    if not found and not episode.info.get("moving"):
+        # Wrong poses or units would only be reported again.
+        add("depth", _check_geometry(episode, depth_THW))
     return found
 
 
-def _check_voxels(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterator[Problem]:
+def _check_voxels(episode: Episode, depth_THW: np.ndarray) -> Found:
     """Check that the grids decode, lie on one lattice, contain the camera, and match the depth."""
     try:
         grid, origin_T3 = episode.voxel_grid, episode.voxel_origin_T3
@@ -89,90 +89,79 @@ def _check_voxels(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterat
         for frame in range(episode.length):  # one at a time, because grids may be large
             episode.voxels([frame])
     except UserError as error:
-        yield Problem(where, None, "voxels", str(error))
+        yield None, str(error)
         return
     for frame, off in off_lattice(origin_T3, grid.cell_m):
-        what = f"the grid's corner is {off:.3g} cells off the lattice of frame 0."
-        yield Problem(where, frame, "voxels", what)
+        yield frame, f"the grid's corner is {off:.3g} cells off the lattice of frame 0."
         return
     for frame in outside(origin_T3, grid, episode.world_from_camera[:, :3, 3]):
-        what = (
-            "the camera is not in the grid: origins must be in metres, in the world of the poses."
-        )
-        yield Problem(where, frame, "voxels", what)
+        what = "origins must be in metres, in the world of the poses."
+        yield frame, f"the camera is not in the grid: {what}"
         return
     looks = np.unique(np.linspace(0, episode.length - 1, LOOKS).round().astype(int))
     worst = disagreement(episode.voxels(looks), depth_THW[looks], episode.camera(looks))
     if worst is not None:
-        yield Problem(
-            where,
-            int(looks[worst[0]]),
-            "voxels",
+        what = (
             f"disagrees with the depth: {worst[1]:.0%} of the points that the camera sees in the "
             "grid have only empty cells around them; check the order of the axes, the origins "
-            "and the cell.",
+            "and the cell."
         )
+        yield int(looks[worst[0]]), what
 
 
 def check_depth(depth_THW: np.ndarray, where: str) -> list[Problem]:
     """Check that depths (T, H, W) are plausible in metres and not mostly missing."""
+    return [Problem(where, frame, "depth", what) for frame, what in _check_units(depth_THW)]
+
+
+def _check_units(depth_THW: np.ndarray) -> Found:
     valid = depth_THW[np.isfinite(depth_THW) & (depth_THW > 0)]
     bad = np.flatnonzero(~np.isfinite(depth_THW).all((1, 2)))
     if len(bad):
-        return [Problem(where, int(bad[0]), "depth", "contains values that are not finite.")]
+        yield int(bad[0]), "contains values that are not finite."
+        return
     median = float(np.median(valid)) if len(valid) else 0.0
     if len(valid) and not _plausible(median):
         frame = _first_frame(depth_THW, median < MEDIAN_DEPTH_M[0])
-        return [_wrong_unit(where, frame, "the recording", median)]
+        yield frame, _wrong_unit("the recording", median)
+        return
     missing = float((depth_THW <= 0).mean())
     if missing > MOST_MISSING:
-        return [
-            Problem(
-                where,
-                None,
-                "depth",
-                f"{missing:.0%} of the pixels have no depth (0, saturated, or beyond the largest "
-                "depth stored): the unit is wrong or the depth images are empty; correct the "
-                "depth scale.",
-            )
-        ]
+        what = (
+            f"{missing:.0%} of the pixels have no depth (0, saturated, or beyond the largest depth "
+            "stored): the unit is wrong or the depth images are empty; correct the depth scale."
+        )
+        yield None, what
+        return
     for frame, image in enumerate(depth_THW):
         seen = image[image > 0]
         if len(seen) > (1 - MOST_MISSING) * image.size and not _plausible(np.median(seen)):
-            return [_wrong_unit(where, frame, "this frame", float(np.median(seen)))]
-    return []
+            yield frame, _wrong_unit("this frame", float(np.median(seen)))
+            return
 
 
-def _check_saturation(depth_THW: np.ndarray, where: str) -> list[Problem]:
+def _check_saturation(depth_THW: np.ndarray) -> Found:
     """Check that no stored depth has the saturated value, which marks missing depth."""
     saturated = depth_THW > (SATURATED - 0.5) / MILLIMETRES
-    if not saturated.any():
-        return []
-    return [
-        Problem(
-            where,
-            int(np.flatnonzero(saturated.any((1, 2)))[0]),
-            "depth",
+    if saturated.any():
+        what = (
             f"{saturated.mean():.1%} of the episode's pixels hold the saturated value {SATURATED}, "
             "which is not a measurement: import the recording again with --overwrite, which stores "
-            "0 there, or store 0 there yourself.",
+            "0 there, or store 0 there yourself."
         )
-    ]
+        yield int(np.flatnonzero(saturated.any((1, 2)))[0]), what
 
 
 def _plausible(median: float) -> bool:
     return MEDIAN_DEPTH_M[0] <= median <= MEDIAN_DEPTH_M[1]
 
 
-def _wrong_unit(where: str, frame: int, subject: str, median: float) -> Problem:
+def _wrong_unit(subject: str, median: float) -> str:
     small = median < MEDIAN_DEPTH_M[0]
     wrong = "metres were read as millimetres" if small else "the scale is too small"
-    return Problem(
-        where,
-        frame,
-        "depth",
+    return (
         f"the median depth of {subject} is {median:.3g} m: the unit is wrong ({wrong}?); correct "
-        "the depth scale.",
+        "the depth scale."
     )
 
 
@@ -185,40 +174,33 @@ def _first_frame(depth_THW: np.ndarray, small: bool) -> int:
     return 0
 
 
-def _check_geometry(episode: Episode, depth_THW: np.ndarray, where: str) -> Iterator[Problem]:
+def _check_geometry(episode: Episode, depth_THW: np.ndarray) -> Found:
     worst = find_disagreement(episode, depth_THW)
     if worst is not None:
-        yield Problem(
-            where,
-            worst.second,
-            "depth",
+        what = (
             f"disagrees with the poses: {worst.floating:.0%} of the points that frames such as "
             f"{worst.first} see float in front of the surfaces that this frame sees; check the "
-            "intrinsics, the depth scale, the axes of the camera and the direction of the poses.",
+            "intrinsics, the depth scale, the axes of the camera and the direction of the poses."
         )
+        yield worst.second, what
 
 
-def _check_intrinsics(episode: Episode, where: str) -> Iterator[Problem]:
+def _check_intrinsics(episode: Episode) -> Found:
     fx, fy, cx, cy = (float(value) for value in episode.intrinsics_4)
     if not np.isfinite(episode.intrinsics_4).all() or min(fx, fy) <= 0:
-        what = f"({fx}, {fy}, {cx}, {cy}) must be finite, with fx and fy above 0."
-        yield Problem(where, None, "intrinsics", what)
+        yield None, f"({fx}, {fy}, {cx}, {cy}) must be finite, with fx and fy above 0."
     elif not (0 < cx < episode.width and 0 < cy < episode.height):
-        yield Problem(
-            where,
-            None,
-            "intrinsics",
+        what = (
             f"the principal point ({cx:.1f}, {cy:.1f}) lies outside the "
-            f"{episode.width}×{episode.height} image: the intrinsics belong to another image size.",
+            f"{episode.width}×{episode.height} image: the intrinsics belong to another image size."
         )
+        yield None, what
 
 
-def _check_poses(episode: Episode, where: str) -> Iterator[Problem]:
+def _check_poses(episode: Episode) -> Found:
     pose = np.asarray(episode.world_from_camera, np.float64)
-    finite = np.isfinite(pose).all((1, 2))
-    if not finite.all():
-        frame = int(np.flatnonzero(~finite)[0])
-        yield Problem(where, frame, "world_from_camera", "contains NaN or infinity.")
+    for frame in np.flatnonzero(~np.isfinite(pose).all((1, 2)))[:1]:
+        yield int(frame), "contains NaN or infinity."
         return
     rotation = pose[:, :3, :3]
     off = np.abs(np.swapaxes(rotation, 1, 2) @ rotation - np.eye(3)).max((1, 2))
@@ -230,41 +212,31 @@ def _check_poses(episode: Episode, where: str) -> Iterator[Problem]:
             what = "the rotation is a mirror image (determinant −1)"
         if bottom[frame] > 1e-6:
             what = "the last row is not (0, 0, 0, 1)"
-        yield Problem(
-            where, int(frame), "world_from_camera", f"{what}: it must be a rigid transform."
-        )
+        yield int(frame), f"{what}: it must be a rigid transform."
 
 
-def _check_actions(episode: Episode, where: str) -> Iterator[Problem]:
+def _check_actions(episode: Episode) -> Found:
     actions = episode.actions
     if actions is None:
         return
-    finite = np.isfinite(actions).all(1)
-    if not finite.all():
-        frame = int(np.flatnonzero(~finite)[0])
-        yield Problem(where, frame, "actions", "contains NaN or infinity.")
+    for frame in np.flatnonzero(~np.isfinite(actions).all(1))[:1]:
+        yield int(frame), "contains NaN or infinity."
         return
     if actions.shape[1] != PLANAR:  # for other kinds of control the motion is unknown
         return
     metres, radians = action_errors(episode.world_from_camera, actions)
     for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:
-        yield Problem(
-            where,
-            int(frame),
-            "actions",
+        what = (
             f"the action ends {metres[frame]:.3g} m and {np.degrees(radians[frame]):.3g} degrees "
-            f"away from the pose of frame {frame + 1}: actions and poses disagree.",
+            f"away from the pose of frame {frame + 1}: actions and poses disagree."
         )
+        yield int(frame), what
 
 
 def action_errors(
     world_from_camera: np.ndarray, actions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance between the end of every action and the pose of the next frame.
-
-    Args:
-        world_from_camera: (T, 4, 4) poses.
-        actions: (T − 1, 3) dx, dy, dyaw.
+    """Return how far actions (T − 1, 3) end from the poses (T, 4, 4) of the next frames.
 
     Returns:
         (T − 1,) distances in metres and (T − 1,) angles in radians.
@@ -303,12 +275,9 @@ _WIDEST_TURN = np.radians(60)
 
 @dataclasses.dataclass(frozen=True)
 class Disagreement:
-    """The pair of frames that disagrees most.
+    """The pair of frames that disagrees most: points of the first were moved into the second.
 
-    Attributes:
-        first: the frame whose points were moved.
-        second: the frame they were moved into.
-        floating: share of its points that float, over all pairs of this kind.
+    ``floating`` is the share of points that float, over all pairs of this kind.
     """
 
     first: int
@@ -317,11 +286,9 @@ class Disagreement:
 
 
 def find_disagreement(episode: Episode, depth_THW: np.ndarray) -> Disagreement | None:
-    """Return where depth and cameras disagree; None if they agree or nothing overlaps.
+    """Return where depths (T, H, W) and finite, rigid cameras disagree.
 
-    Args:
-        episode: its poses and intrinsics are used; they must be finite and rigid.
-        depth_THW: all its depths in metres.
+    None if they agree or nothing overlaps.
     """
     worst: Disagreement | None = None
     most = MOST_FLOATING * max(1.0, LIMIT_SIDE / min(depth_THW.shape[1:]))
@@ -345,13 +312,8 @@ def share_floating(
     fx, fy, cx, cy = np.asarray(episode.intrinsics_4, np.float64)
     pose = np.asarray(episode.world_from_camera, np.float64)
     step = max(1, int(np.sqrt(height * width / SAMPLES)))
-    v, u = np.mgrid[0:height:step, 0:width:step]
-    z = depth_THW[first][v, u].astype(np.float64)
-    seen = z > 0
-    u, v, z = u[seen] + 0.5, v[seen] + 0.5, z[seen]
-    points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], -1)
-    world = points @ pose[first, :3, :3].T + pose[first, :3, 3]
-    local = (world - pose[second, :3, 3]) @ pose[second, :3, :3]
+    points, _ = measured_points(depth_THW[first], episode.intrinsics_4, pose[first], step)
+    local = (points - pose[second, :3, 3]) @ pose[second, :3, :3]
     z = local[:, 2]
     safe = np.where(z > 0.1, z, 1.0)
     u, v = local[:, 0] / safe * fx + cx - 0.5, local[:, 1] / safe * fy + cy - 0.5
@@ -365,10 +327,9 @@ def share_floating(
 def _depth_between(
     depth_HW: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate depth between pixels: 1/z is linear on a plane, so this is exact there.
+    """Interpolate depth between pixels, and return where it is reliable (no edge, no hole).
 
-    Returns:
-        Depths, and where they are reliable (no edge, no missing measurement).
+    1/z is linear on a plane, so this is exact there.
     """
     u0, v0 = u.astype(int), v.astype(int)
     corners = np.stack([depth_HW[v0 + b, u0 + a] for b in (0, 1) for a in (0, 1)])

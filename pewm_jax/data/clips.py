@@ -6,12 +6,13 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
+import jax
 import numpy as np
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.geometry.actions import PLANAR, compose
-from pewm_jax.types import Camera, Clip, Frames
+from pewm_jax.types import Clip
 
 ReadFeatures: TypeAlias = Callable[[Episode, np.ndarray], np.ndarray]
 """``read(episode, frames_S) -> features_ShwF``: cached features of an episode's frames."""
@@ -31,20 +32,14 @@ class Choice:
 
 
 def choose(config: Config, length: int, rng: np.random.Generator, where: str = "episode") -> Choice:
-    """Draw a clip from an episode: its stride, its start and its context frames.
+    """Draw a clip from an episode of ``length`` frames: stride, start and context frames.
 
     Every stride of ``data.stride_min … stride_max`` that fits is equally likely, and so is every
     start. The context has the clip's first frame and one frame from each of S − 1 equal parts of
     the past, the last of which is the frame just before the clip.
 
-    Args:
-        config: ``clip.frames``, ``data.stride_min``, ``data.stride_max``, ``data.context``.
-        length: frames of the episode.
-        rng: source of all randomness.
-        where: the episode's name in error messages.
-
     Raises:
-        UserError: the episode is too short for one clip.
+        UserError: the episode, named ``where``, is too short for one clip.
     """
     steps = config.model.clip.frames - 1
     largest = min(config.data.stride_max, (length - 1) // steps)
@@ -63,15 +58,9 @@ def choose(config: Config, length: int, rng: np.random.Generator, where: str = "
 
 
 def choose_context(start: int, slots: int, rng: np.random.Generator | None = None) -> np.ndarray:
-    """Return the context frames of a clip: at most ``slots`` frames up to ``start``.
+    """Return the context frames of a clip: at most ``slots``, increasing, the last is ``start``.
 
-    Args:
-        start: first frame of the clip; always the last context frame.
-        slots: S.
-        rng: draws the frame of each part of the past; None takes the middle one.
-
-    Returns:
-        (≤ S,) increasing frame numbers.
+    ``rng`` draws the frame of each part of the past; None takes the middle one.
     """
     past = slots - 1
     if start <= past:
@@ -110,15 +99,13 @@ def cut(
         A NumPy clip without batch axis: rgb uint8, depth float32 metres, and the actions and the
         grids around the agent that the episode has.
     """
-    wanted, place = np.unique(
-        np.concatenate([choice.frames_T, choice.context_S]), return_inverse=True
-    )
+    wanted, place = np.unique([*choice.frames_T, *choice.context_S], return_inverse=True)
     frames = episode.frames(wanted)
     count = len(choice.frames_T)
     valid = np.arange(slots) < len(choice.context_S)
     fill = np.full(slots, place[0])
     fill[: len(choice.context_S)] = place[count:]
-    context = _take(frames, fill)
+    context = jax.tree.map(lambda x: x[fill], frames)
     context.rgb_THWC[~valid] = 0
     context.depth_THW[~valid] = 0
     extras = {}
@@ -128,7 +115,7 @@ def cut(
         found = episode.voxels(choice.frames_T)
         extras |= {"classes_TXYZ": found.classes_TXYZ, "origin_T3": found.origin_T3}
     return Clip(
-        _take(frames, place[:count]),
+        jax.tree.map(lambda x: x[place[:count]], frames),
         context,
         valid,
         None if episode.actions is None else join_actions(episode.actions, choice.frames_T),
@@ -137,49 +124,17 @@ def cut(
 
 
 def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:
-    """Return the actions that lead from each frame of a clip to the next.
+    """Return the (T − 1, A) float32 actions that lead from each frame of a clip to the next.
 
-    Args:
-        actions_TA: (episode's frames − 1, A), action k leads from frame k to frame k + 1 of the
-            episode.
-        frames_T: (T,) evenly spaced frames of the episode.
-
-    Returns:
-        (T − 1, A) float32. The actions between two frames of the clip become one: the motions of
-        planar actions (A = 3) are composed; actions of other kinds are concatenated,
-        (T − 1, stride · A).
+    Action k leads from frame k to frame k + 1 of the episode; the clip's frames are evenly spaced.
+    The actions between two of them become one: the motions of planar actions (A = 3) are composed;
+    actions of other kinds are concatenated, (T − 1, stride · A).
     """
     stride = int(frames_T[1] - frames_T[0]) if len(frames_T) > 1 else 1
     steps_TSA = actions_TA[frames_T[:-1, None] + np.arange(stride)]
     if actions_TA.shape[1] == PLANAR:
         return compose(steps_TSA)
     return steps_TSA.reshape(len(steps_TSA), stride * actions_TA.shape[1]).astype(np.float32)
-
-
-def clip_at(
-    config: Config, episode: Episode, start: int, stride: int = 1, frames: int | None = None
-) -> Clip:
-    """Return the clip at given frames; its context is evenly spaced, without randomness.
-
-    Args:
-        config: ``clip.frames`` and ``data.context``.
-        episode: the episode.
-        start: its first frame.
-        stride: actions between two consecutive frames.
-        frames: its length, by default ``clip.frames``.
-
-    Raises:
-        UserError: the episode ends before the clip does.
-    """
-    count = config.model.clip.frames if frames is None else frames
-    chosen = start + stride * np.arange(count)
-    if start < 0 or chosen[-1] >= episode.length:
-        raise UserError(
-            f"episode {episode.name} has {episode.length} frames, so it has no clip from {start} "
-            f"to {chosen[-1]}; start earlier or collect longer episodes."
-        )
-    slots = config.data.context
-    return cut(episode, Choice(chosen, choose_context(start, slots)), slots)
 
 
 def stack(clips: Sequence[Clip]) -> Clip:
@@ -199,28 +154,14 @@ def stack(clips: Sequence[Clip]) -> Clip:
             )
         return None if None in shapes else np.stack(list(parts))  # type: ignore[arg-type]
 
-    def frames(parts: Sequence[Frames]) -> Frames:
-        return Frames(
-            np.stack([part.rgb_THWC for part in parts]),
-            np.stack([part.depth_THW for part in parts]),
-            Camera(
-                np.stack([part.camera.intrinsics_4 for part in parts]),
-                np.stack([part.camera.world_from_camera for part in parts]),
-            ),
-        )
-
     names = dict.fromkeys(name for clip in clips for name in clip.extras)
     found = {name: optional(name, [clip.extras.get(name) for clip in clips]) for name in names}
+    required = [(clip.frames, clip.context, clip.context_valid_S) for clip in clips]
+    stacked, context, valid = jax.tree.map(lambda *parts: np.stack(parts), *required)
     return Clip(
-        frames([clip.frames for clip in clips]),
-        frames([clip.context for clip in clips]),
-        np.stack([clip.context_valid_S for clip in clips]),
+        stacked,
+        context,
+        valid,
         optional("actions_TA", [clip.actions_TA for clip in clips]),
         {k: v for k, v in found.items() if v is not None},
     )
-
-
-def _take(frames: Frames, rows: np.ndarray) -> Frames:
-    """Return copies of the frames ``rows``."""
-    camera = Camera(frames.camera.intrinsics_4[rows], frames.camera.world_from_camera[rows])
-    return Frames(frames.rgb_THWC[rows], frames.depth_THW[rows], camera)

@@ -15,6 +15,7 @@ the agent's actual motion, not its intended one. Each episode is validated befor
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import sys
@@ -29,9 +30,9 @@ from pewm_jax import registry as kinds
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import resume
 from pewm_jax.data.checks import check_episode
-from pewm_jax.data.dataset import describe_shard, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, read_episode, write_episode
 from pewm_jax.data.importer import planar_actions
+from pewm_jax.data.make_episode import require_at_least
 from pewm_jax.io.progress import Meter
 
 SPLITS = ("train", "validation", "test")
@@ -44,6 +45,7 @@ FORM = (
     "attribute intrinsics_4"
 )
 """The arrays that an environment has to provide, for error messages."""
+FIX = "; fix it."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,13 +83,10 @@ class CollectEnvConfig:
 
     def __post_init__(self):
         """Validate."""
-        for name in ("train", "validation", "test", "seed"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"--{name} is {getattr(self, name)}: use 0 or more.")
+        require_at_least(self, 0, "train", "validation", "test", "seed")
         if self.train + self.validation + self.test == 0:
             raise ConfigError("--train, --validation and --test are all 0: nothing to collect.")
-        if self.shard_episodes < 1:
-            raise ConfigError(f"--shard-episodes is {self.shard_episodes}: use 1 or more.")
+        require_at_least(self, 1, "shard_episodes")
         if not 2 <= self.min_frames <= self.frames:
             raise ConfigError(
                 f"--min-frames is {self.min_frames} and --frames {self.frames}: use 2 or more, and "
@@ -95,9 +94,6 @@ class CollectEnvConfig:
             )
         if not 0 <= self.persistence <= 1:
             raise ConfigError(f"--persistence is {self.persistence}: use a probability, 0 to 1.")
-        self._check_names()
-
-    def _check_names(self) -> None:
         for flag, value in (("--env", self.env), ("--policy", self.policy or "a:b")):
             module, colon, name = value.partition(":")
             if not (colon and name and all(part.isidentifier() for part in module.split("."))):
@@ -131,14 +127,7 @@ def make(
     split: str,
     index: int,
 ) -> bytes:
-    """Run one episode and return its record.
-
-    Args:
-        env: from ``open_env``.
-        policy: from ``open_policy``.
-        config: the settings.
-        split: the episode's split.
-        index: the episode's number in the split.
+    """Run one episode, number ``index`` of a split, and return its record.
 
     Raises:
         UserError: the environment does not provide the arrays needed or ends its episodes too soon,
@@ -162,12 +151,13 @@ def _walk(
     env: Any, act: Callable[[Any], Any], config: CollectEnvConfig, seed: int
 ) -> tuple[list[dict[str, np.ndarray]], np.ndarray, str]:
     """Return the frames of an episode, the intrinsics, and the scene's name."""
-    observation, info = _call_user(config, "reset", env.reset, seed=seed)
+    observation, info = _call_user(config, ": reset failed", FIX, env.reset, seed=seed)
     first, intrinsics = _read_frame(env, observation, info, config)
     seen = [first]
     while len(seen) < config.frames:
-        action = _call_user(config, "the policy", act, observation)
-        observation, _, terminated, truncated, info = _call_user(config, "step", env.step, action)
+        action = _call_user(config, ": the policy failed", FIX, act, observation)
+        after = _call_user(config, ": step failed", FIX, env.step, action)
+        observation, _, terminated, truncated, info = after
         frame, same = _read_frame(env, observation, info, config)
         if not np.array_equal(same, intrinsics) or frame["rgb"].shape != first["rgb"].shape:
             raise UserError(
@@ -183,17 +173,17 @@ def _walk(
     return seen, intrinsics, str(shown or config.env.partition(":")[2])
 
 
-def _call_user(config: CollectEnvConfig, what: str, function: Callable, *args: Any, **kwargs: Any):
+def _call_user(
+    config: CollectEnvConfig, failure: str, fix: str, function: Callable, *args, **kwargs
+):
     """Call a user's function; raise any exception as a ``UserError``."""
     try:
         return function(*args, **kwargs)
     except UserError:
         raise
     except Exception as error:
-        raise UserError(
-            f"--env {config.env}: {what} failed ({type(error).__name__}: "
-            f"{' '.join(str(error).split())}); fix it."
-        ) from error
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise UserError(f"--env {config.env}{failure} ({reason}){fix}") from error
 
 
 def _read_frame(
@@ -201,11 +191,10 @@ def _read_frame(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Return the frame that an environment provides, and the intrinsics; check their form."""
     places = [place for place in (observation, info) if isinstance(place, Mapping)]
-
-    def find(name: str) -> Any:
-        return next((place[name] for place in places if name in place), None)
-
-    found = {name: find(name) for name in ("rgb", "depth", "pose", "intrinsics")}
+    found: dict[str, Any] = {
+        name: next((place[name] for place in places if name in place), None)
+        for name in ("rgb", "depth", "pose", "intrinsics")
+    }
     if found["intrinsics"] is None:
         found["intrinsics"] = getattr(getattr(env, "unwrapped", env), "intrinsics_4", None)
     absent = [name for name, value in found.items() if value is None]
@@ -215,12 +204,10 @@ def _read_frame(
             "observation (a dictionary) or in info."
         )
     frame = {name: np.asarray(value) for name, value in found.items()}
-    size = frame["depth"].shape
+    rgb, depth, size = frame["rgb"], frame["depth"], frame["depth"].shape
     fits = {
-        "rgb": len(size) == 2
-        and frame["rgb"].shape == (*size, 3)
-        and frame["rgb"].dtype == np.uint8,
-        "depth": len(size) == 2 and frame["depth"].dtype.kind == "f",
+        "rgb": len(size) == 2 and rgb.shape == (*size, 3) and rgb.dtype == np.uint8,
+        "depth": len(size) == 2 and depth.dtype.kind == "f",
         "pose": frame["pose"].shape == (4, 4),
         "intrinsics": frame["intrinsics"].shape == (4,),
     }
@@ -229,8 +216,7 @@ def _read_frame(
         what = ", ".join(f"{name} {frame[name].shape} {frame[name].dtype}" for name in wrong)
         raise UserError(f"--env {config.env} provides {what}: provide {FORM}.")
     # Copied, because an environment may reuse its buffers.
-    kept = {name: frame[name].copy() for name in ("rgb", "depth", "pose")}
-    return kept, frame["intrinsics"]
+    return {name: frame[name].copy() for name in ("rgb", "depth", "pose")}, frame["intrinsics"]
 
 
 def _record(
@@ -276,20 +262,10 @@ def open_env(config: CollectEnvConfig) -> Any:
     Raises:
         UserError: no environment has this name, it cannot be created, or it is not an environment.
     """
-    arguments = json.loads(config.env_args)
-    module, _, name = config.env.partition(":")
-    made = getattr(_module(module, "--env"), name, None)
-    if made is None:
-        made = _registered(config, name)
-    try:
-        env = made(**arguments)
-    except UserError:
-        raise
-    except Exception as error:  # a user's function may raise anything
-        raise UserError(
-            f"--env {config.env} cannot be created ({type(error).__name__}: "
-            f"{' '.join(str(error).split())}): fix it, or its --env-args."
-        ) from error
+    made, name = _named(config.env, "--env")
+    made = _registered(config, name) if made is None else made
+    fix = ": fix it, or its --env-args."
+    env = _call_user(config, " cannot be created", fix, made, **json.loads(config.env_args))
     for wanted in ("reset", "step", "close", "action_space"):
         if not hasattr(env, wanted):
             raise UserError(
@@ -314,15 +290,10 @@ def _registered(config: CollectEnvConfig, name: str) -> Callable[..., Any]:
 
 
 def open_policy(config: CollectEnvConfig) -> Callable[[Any], Any] | None:
-    """Return the policy that ``--policy`` names, or None.
-
-    Raises:
-        UserError: the function does not exist.
-    """
+    """Return the policy that ``--policy`` names, or None; UserError if it does not exist."""
     if not config.policy:
         return None
-    module, _, name = config.policy.partition(":")
-    found = getattr(_module(module, "--policy"), name, None)
+    found, name = _named(config.policy, "--policy")
     if not callable(found):
         raise UserError(
             f"--policy {config.policy}: the module has no function {name}; give MODULE:FUNCTION "
@@ -331,25 +302,21 @@ def open_policy(config: CollectEnvConfig) -> Callable[[Any], Any] | None:
     return found
 
 
-def _module(name: str, flag: str) -> Any:
-    """Import a user's module; it may also be in the current folder."""
+def _named(text: str, flag: str) -> tuple[Any, str]:
+    """Return what MODULE:NAME names, or None, and NAME; the module may be in the current folder."""
+    module, _, name = text.partition(":")
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.append(here)
-    return kinds.imported(name, flag)
+    return getattr(kinds.imported(module, flag), name, None), name
 
 
 def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) -> None:
-    """Create a dataset from an environment, or its missing shards.
-
-    Args:
-        config: what to make and where.
-        log: receives the lines to print.
+    """Create a dataset from an environment, or its missing shards; ``log`` prints lines.
 
     Raises:
-        UserError: the environment or the policy cannot be opened, the environment does not provide
-            the required arrays, its episodes are too short or fail validation, or the output folder
-            contains a dataset with other settings.
+        UserError: as ``open_env``, ``open_policy`` and ``make``, or the output folder contains a
+            dataset with other settings.
     """
     splits = resume.unfinished_splits(
         config.out,
@@ -368,7 +335,7 @@ def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) ->
             yield make(env, policy, config, split, index)
             meter.advance(1)
 
-    try:
+    with contextlib.closing(env):
         # Make one episode before writing anything, so that an unsuitable environment fails here.
         make(env, policy, config, splits[0].folder.name, 0)
         total = sum(config.episodes(split.folder.name) for split in splits)
@@ -380,9 +347,6 @@ def collect_env(config: CollectEnvConfig, log: Callable[[str], None] = print) ->
                     sum(map(len, split.wanted.values())) - sum(map(len, missing.values()))
                 )
                 for path, indices in missing.items():
-                    write_shard(path, records(split.folder.name, indices, meter))
-                    split.done[path.name] = describe_shard(path)
+                    split.write(path, records(split.folder.name, indices, meter))
                 split.publish()
         log(meter.summary())
-    finally:
-        env.close()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import os
 import shutil
@@ -23,7 +22,7 @@ from grain import sources
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.record_format import VERSION, DamagedError
-from pewm_jax.io import atomic
+from pewm_jax.io import atomic, store
 
 MANIFEST = "dataset.json"
 UNFINISHED = "collecting.json"
@@ -32,14 +31,7 @@ UNFINISHED = "collecting.json"
 
 @dataclasses.dataclass(frozen=True)
 class Shard:
-    """One file of a split.
-
-    Attributes:
-        file: its name inside the split folder.
-        records: number of episodes in it.
-        bytes: its size.
-        sha256: hash of the whole file.
-    """
+    """One file of a split: its name there, its number of episodes, its size, its hash."""
 
     file: str
     records: int
@@ -69,17 +61,9 @@ class Manifest:
         return sum(shard.records for shard in self.shards)
 
 
-def write_shard(path: Path, records: Iterable[bytes]) -> int:
-    """Write records to an ArrayRecord file atomically.
-
-    Returns:
-        The number of records written.
-
-    Raises:
-        UserError: the file cannot be written, e.g. because the disk is full.
-    """
+def write_shard(path: Path, records: Iterable[bytes]) -> Shard:
+    """Write records to an ArrayRecord file atomically; UserError if that fails (a full disk)."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    count = 0
     with atomic.replacing(path) as partial:
         # Images are compressed already; with one record per group, reading a single one is cheap.
         with _refused_writes(path):
@@ -88,13 +72,12 @@ def write_shard(path: Path, records: Iterable[bytes]) -> int:
             for record in records:
                 with _refused_writes(path):
                     writer.write(record)
-                count += 1
         finally:
             with _refused_writes(path):
                 writer.close()
         with partial.open("rb") as file:
             os.fsync(file.fileno())
-    return count
+    return describe_shard(path)
 
 
 @contextlib.contextmanager
@@ -105,63 +88,53 @@ def _refused_writes(path: Path) -> Iterator[None]:
     except RuntimeError as error:
         free = shutil.disk_usage(path.parent).free / 1e6
         raise UserError(
-            f"{path} cannot be written ({str(error).splitlines()[0]}); {free:.0f} MB are free "
-            "there: free some space, or check the folder's quota and permissions, then run the "
-            "same command again."
+            f"{path} cannot be written ({_first_line(error)}); {free:.0f} MB are free there: free "
+            "some space, or check the folder's quota and permissions, then run the same command "
+            "again."
         ) from None
 
 
 def describe_shard(path: Path) -> Shard:
     """Return a shard's number of records, size and hash."""
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return Shard(path.name, count_records(path), path.stat().st_size, digest)
+    return Shard(path.name, count_records(path), path.stat().st_size, store.file_hash(path))
 
 
 def count_records(path: Path) -> int:
-    """Return the number of records of an ArrayRecord file.
+    """Return the number of records; UserError for a truncated file, or one of another kind."""
+    state = "it is truncated or damaged"
+    with _opened(path, f"{path} is not a readable ArrayRecord file", state) as reader:
+        count = reader.num_records()
+    if count == 0:
+        raise UserError(f"{path} holds no readable record: {state}, delete it and make it again.")
+    return count
 
-    Raises:
-        UserError: the file is not an ArrayRecord file, or is truncated.
-    """
+
+def read_record(path: Path, index: int) -> bytes:
+    """Read one record of an ArrayRecord file; UserError if it cannot be read."""
+    failure = f"{path}, record {index} cannot be read"
+    with _opened(path, failure, "the file is damaged") as reader:
+        return reader.read([index])[0]
+
+
+@contextlib.contextmanager
+def _opened(path: Path, failure: str, state: str) -> Iterator[Any]:
+    """Open an ArrayRecord file; raise its errors as a ``UserError``."""
     reader = None
     try:
         reader = array_file.ArrayRecordReader(str(path))
-        count = reader.num_records()
-    except (RuntimeError, ValueError) as error:
+        yield reader
+    except (RuntimeError, ValueError, IndexError) as error:
         raise UserError(
-            f"{path} is not a readable ArrayRecord file ({str(error).splitlines()[0]}); it is "
-            "truncated or damaged, delete it and make it again."
+            f"{failure} ({_first_line(error)}); {state}, delete it and make it again."
         ) from None
     finally:
         if reader is not None:
             with contextlib.suppress(RuntimeError, ValueError):
                 reader.close()
-    if count == 0:
-        raise UserError(
-            f"{path} holds no readable record: it is truncated or damaged, delete it and make it "
-            "again."
-        )
-    return count
 
 
-def read_record(path: Path, index: int) -> bytes:
-    """Read one record of an ArrayRecord file.
-
-    Raises:
-        UserError: the record cannot be read.
-    """
-    reader = array_file.ArrayRecordReader(str(path))
-    try:
-        return reader.read([index])[0]
-    except (RuntimeError, ValueError, IndexError) as error:
-        raise UserError(
-            f"{path}, record {index} cannot be read ({str(error).splitlines()[0]}); the file is "
-            "damaged, delete it and make it again."
-        ) from None
-    finally:
-        with contextlib.suppress(RuntimeError, ValueError):
-            reader.close()
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -227,11 +200,7 @@ def read_manifest(folder: Path, check_files: bool = True) -> Manifest:
 
 
 def check_size(path: Path, shard: Shard) -> None:
-    """Compare a file's size with the one listed in ``dataset.json``.
-
-    Raises:
-        UserError: the file is missing or has another size.
-    """
+    """Raise UserError if a file is missing or does not have the size listed for its shard."""
     if not path.is_file():
         raise UserError(f"{path} is missing but {MANIFEST} lists it; make the split again.")
     size = path.stat().st_size
@@ -266,8 +235,7 @@ class EpisodeSource(Sequence[Episode]):
             self._records: Any = sources.ArrayRecordDataSource(files)
         except (RuntimeError, ValueError) as error:
             raise UserError(
-                f"{self.path}: the shards do not open ({str(error).splitlines()[0]}); make the "
-                "split again."
+                f"{self.path}: the shards do not open ({_first_line(error)}); make the split again."
             ) from None
         self._length = len(self._records)
         if self._length != self.manifest.records:
@@ -288,7 +256,14 @@ class EpisodeSource(Sequence[Episode]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"episode {index} of {self.path}, which has {len(self)}")
         position = int(index) % len(self)
-        record, where = self._record(position), self.where(position)
+        where = self.where(position)
+        try:
+            record = self._records[position]
+        except (RuntimeError, ValueError) as error:
+            raise DamagedError(
+                f"{where} cannot be read ({_first_line(error)}); the shard is damaged, delete it "
+                "and make the split again."
+            ) from None
         try:
             return read_episode(record, where)
         except UserError:
@@ -297,15 +272,6 @@ class EpisodeSource(Sequence[Episode]):
             raise DamagedError(
                 f"{where}: the header and the payload do not match ({error!r}); the record is "
                 "damaged, collect or import it again."
-            ) from None
-
-    def _record(self, index: int) -> bytes:
-        try:
-            return self._records[index]
-        except (RuntimeError, ValueError) as error:
-            raise DamagedError(
-                f"{self.where(index)} cannot be read ({str(error).splitlines()[0]}); the shard is "
-                "damaged, delete it and make the split again."
             ) from None
 
     def where(self, index: int, between: str = ", record ") -> str:

@@ -16,12 +16,10 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.data import voxels as voxel_frames
 from pewm_jax.data.record_format import (
-    CONVENTIONS,
-    UNITS,
-    VERSION,
     DamagedError,
     array_shapes,
     check_span,
+    new_header,
     pack_record,
     read_header,
     shape_fits,
@@ -43,15 +41,15 @@ class EpisodeArrays:
     """The arrays of an episode to write.
 
     Attributes:
-        rgb_THWC: (T, H, W, 3) uint8.
-        depth_THW: (T, H, W) float metres along z, 0 = no measurement.
-        intrinsics_4: (4,) fx, fy, cx, cy in pixels, centres at +0.5.
+        rgb_THWC: uint8.
+        depth_THW: float metres along z, 0 = no measurement.
+        intrinsics_4: fx, fy, cx, cy in pixels, centres at +0.5.
         world_from_camera: (T, 4, 4) camera-to-world.
         actions: (T − 1, 3) dx, dy, dyaw, or (T − 1, A) of another kind of control, or None if the
             camera does not move like the agent.
-        action_ids: (T − 1,) discrete actions, or None.
-        ids_THW: (T, H, W) instance ids from −1 (nothing) to 65534, or None.
-        voxels: the grid of class ids around the agent at each frame, or None.
+        action_ids: (T − 1,) discrete actions.
+        ids_THW: instance ids from −1 (nothing) to 65534.
+        voxels: the grid of class ids around the agent at each frame.
     """
 
     rgb_THWC: np.ndarray
@@ -72,13 +70,10 @@ class Episode:
         name: name of the episode, e.g. ``house-000012/follow``.
         scene: name of the scene it was recorded in.
         length: T, its number of frames.
-        height: image height in pixels.
-        width: image width in pixels.
-        intrinsics_4: (4,) float32.
         world_from_camera: (T, 4, 4) float32.
         actions: (T − 1, A) float32 or None; A = 3 is (dx, dy, dyaw).
         action_ids: (T − 1,) int32 or None.
-        voxel_origin_T3: (T, 3) float32 lowest corners of the grids around the agent, or None.
+        voxel_origin_T3: float32 lowest corners of the grids around the agent, or None.
         info: further JSON values, e.g. ``return_frame`` of a revisit episode.
         header: the whole JSON header.
         record: the bytes.
@@ -117,33 +112,25 @@ class Episode:
         Raises:
             DamagedError: an image does not decode; the message names the frame.
         """
-        chosen = np.arange(self.length) if indices is None else np.asarray(indices, np.int64)
+        chosen = self._chosen(indices)
         rgb = np.empty((len(chosen), self.height, self.width, 3), np.uint8)
         depth = np.empty((len(chosen), self.height, self.width), np.float32)
         for row, index in enumerate(chosen):
-            rgb[row] = self._image("rgb", int(index))[..., ::-1]
-            depth[row] = self._image("depth", int(index))
+            rgb[row] = self._image("rgb", index)[..., ::-1]
+            depth[row] = self._image("depth", index)
         depth /= MILLIMETRES
         return Frames(rgb, depth, self.camera(chosen))
 
     def ids(self, indices: Sequence[int] | np.ndarray | None = None) -> np.ndarray:
-        """Decode instance ids (T, H, W) int32, −1 = nothing.
-
-        Raises:
-            UserError: the episode has no instance ids.
-        """
+        """Decode instance ids (T, H, W) int32, −1 = nothing; UserError if the episode has none."""
         if not self.has_ids:
             raise UserError(f"episode {self.name} has no instance ids; collect it with --ids.")
-        chosen = range(self.length) if indices is None else indices
-        return np.stack([self._image("ids", int(i)).astype(np.int32) - 1 for i in chosen])
+        chosen = self._chosen(indices)
+        return np.stack([self._image("ids", i).astype(np.int32) - 1 for i in chosen])
 
     @property
     def voxel_grid(self) -> VoxelGrid | None:
-        """The cell, side and classes of the grids around the agent; None if none were recorded.
-
-        Raises:
-            DamagedError: the header is inconsistent.
-        """
+        """The grids' cell, side and classes, or None; DamagedError for an inconsistent header."""
         stream = self.header["streams"].get("voxels")
         return None if stream is None else voxel_frames.grid_in(stream, f"episode {self.name}")
 
@@ -157,22 +144,25 @@ class Episode:
         grid, origin = self.voxel_grid, self.voxel_origin_T3
         if grid is None or origin is None:
             raise UserError(f"episode {self.name} has no voxels; collect it with --voxels.")
-        chosen = np.arange(self.length) if indices is None else np.asarray(indices, np.int64)
+        chosen = self._chosen(indices)
         found = np.empty((len(chosen), *(grid.side,) * 3), grid.dtype)
-        record, spans = memoryview(self.record), self.header["streams"]["voxels"]["spans"]
         for row, index in enumerate(chosen):
-            if not 0 <= index < self.length:
-                raise IndexError(f"frame {index} of {self.name}, which has {self.length} frames")
-            offset, size = spans[index]
             where = f"episode {self.name}, frame {index}"
-            found[row] = voxel_frames.decode(record[offset : offset + size], grid, where)
+            found[row] = voxel_frames.decode(self._code("voxels", index), grid, where)
         return VoxelFrames(found, origin[chosen], grid.cell_m, grid.names)
 
-    def _image(self, stream: str, index: int) -> np.ndarray:
+    def _chosen(self, indices: Sequence[int] | np.ndarray | None) -> np.ndarray:
+        return np.arange(self.length) if indices is None else np.asarray(indices, np.int64)
+
+    def _code(self, stream: str, index: int) -> memoryview:
+        """Return the bytes of one frame in a stream."""
         if not 0 <= index < self.length:
             raise IndexError(f"frame {index} of {self.name}, which has {self.length} frames")
         offset, size = self.header["streams"][stream]["spans"][index]
-        image = decode_image(memoryview(self.record)[offset : offset + size], cv2.IMREAD_UNCHANGED)
+        return memoryview(self.record)[offset : offset + size]
+
+    def _image(self, stream: str, index: int) -> np.ndarray:
+        image = decode_image(self._code(stream, index), cv2.IMREAD_UNCHANGED)
         shape = (self.height, self.width, 3) if stream == "rgb" else (self.height, self.width)
         if image is None or image.shape != shape:
             raise DamagedError(
@@ -188,17 +178,12 @@ def write_episode(
 ) -> bytes:
     """Encode an episode as one record; the same input gives the same bytes.
 
-    Args:
-        arrays: the arrays of the episode.
-        name: name of the episode.
-        scene: name of the scene.
-        info: JSON values to store in the header.
+    ``info`` has JSON values to store in the header.
 
     Raises:
         UserError: the arrays' shapes or dtypes do not fit together.
     """
     _check_arrays(arrays, name)
-    frames, height, width = arrays.depth_THW.shape
     streams: dict[str, list[bytes]] = {
         "rgb": [_png(image[..., ::-1]) for image in arrays.rgb_THWC],
         "depth": [_png(image) for image in to_millimetres(arrays.depth_THW)],
@@ -210,27 +195,15 @@ def write_episode(
         streams["voxels"] = [voxel_frames.encode(grid) for grid in voxels.classes_TXYZ]
         about["voxels"] = voxel_frames.header_of(voxels)
     small = {
-        "intrinsics": np.asarray(arrays.intrinsics_4, "<f4"),
-        "world_from_camera": np.asarray(arrays.world_from_camera, "<f4"),
-        "actions": None if arrays.actions is None else np.asarray(arrays.actions, "<f4"),
-        "action_ids": None if arrays.action_ids is None else np.asarray(arrays.action_ids, "<i4"),
-        "voxel_origins": None if voxels is None else np.asarray(voxels.origin_T3, "<f4"),
+        "intrinsics": (arrays.intrinsics_4, "<f4"),
+        "world_from_camera": (arrays.world_from_camera, "<f4"),
+        "actions": (arrays.actions, "<f4"),
+        "action_ids": (arrays.action_ids, "<i4"),
+        "voxel_origins": (None if voxels is None else voxels.origin_T3, "<f4"),
     }
-    header: dict[str, Any] = {
-        "format": "pewm-episode",
-        "version": VERSION,
-        "name": name,
-        "scene": scene,
-        "frames": frames,
-        "height": height,
-        "width": width,
-        "units": UNITS,
-        "conventions": CONVENTIONS,
-        "info": dict(info or {}),
-        "arrays": {},
-        "streams": {},
-    }
-    return pack_record(header, {k: v for k, v in small.items() if v is not None}, streams, about)
+    kept = {field: np.asarray(x, dtype) for field, (x, dtype) in small.items() if x is not None}
+    header = new_header(name, scene, arrays.depth_THW.shape, info or {})
+    return pack_record(header, kept, streams, about)
 
 
 def to_millimetres(depth: np.ndarray) -> np.ndarray:
@@ -242,11 +215,7 @@ def to_millimetres(depth: np.ndarray) -> np.ndarray:
 
 
 def read_episode(record: bytes, where: str = "record") -> Episode:
-    """Open a record and decode its small arrays; images stay encoded.
-
-    Args:
-        record: the bytes that ``write_episode`` returned.
-        where: name of the record in error messages.
+    """Open a record, named ``where`` in messages, and decode its small arrays; images stay encoded.
 
     Raises:
         UserError: the record has another format version.
@@ -279,17 +248,13 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
     if ("voxels" in header["streams"]) != ("voxel_origins" in arrays):
         raise DamagedError(f"{where} lacks voxels or voxel_origins; write it again.")
     return Episode(
-        name=header["name"],
-        scene=header["scene"],
+        **{field: header[field] for field in ("name", "scene", "height", "width", "info")},
         length=frames,
-        height=header["height"],
-        width=header["width"],
         intrinsics_4=arrays["intrinsics"],
         world_from_camera=arrays["world_from_camera"],
         actions=arrays.get("actions"),
         action_ids=arrays.get("action_ids"),
         voxel_origin_T3=arrays.get("voxel_origins"),
-        info=header["info"],
         header=header,
         record=record,
     )
@@ -315,11 +280,7 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
     if depth.ndim != 3 or len(depth) == 0:
         raise UserError(f"episode {name}: depth has shape {depth.shape}, expected (T, H, W).")
     frames = len(depth)
-    expected = {
-        "rgb": (*depth.shape, 3),
-        "ids": depth.shape,
-        **array_shapes(frames),
-    }
+    expected = {"rgb": (*depth.shape, 3), "ids": depth.shape, **array_shapes(frames)}
     arrays_by_field = {
         "rgb": rgb,
         "ids": arrays.ids_THW,

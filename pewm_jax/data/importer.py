@@ -5,32 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
 import tyro
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data.checks import (
-    ACTION_M,
-    ACTION_RAD,
-    Problem,
-    action_errors,
-    check_depth,
-    check_episode,
-)
-from pewm_jax.data.dataset import (
-    MANIFEST,
-    Manifest,
-    Shard,
-    check_size,
-    describe_shard,
-    read_manifest,
-    read_record,
-    write_manifest,
-    write_shard,
-)
+from pewm_jax.data import checks, dataset
 from pewm_jax.data.episodes import (
     DEPTH_LIMIT_M,
     SATURATED,
@@ -50,16 +32,9 @@ _AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1)}
 
 @dataclasses.dataclass(frozen=True)
 class _Imported:
-    """A shard of a split made by ``import``; it holds one episode.
+    """A shard of one imported episode: its frames, and whether it has actions and voxels."""
 
-    Attributes:
-        shard: the file.
-        frames: frames of the episode.
-        actions: whether it has actions.
-        voxels: whether it has voxels.
-    """
-
-    shard: Shard
+    shard: dataset.Shard
     frames: int
     actions: bool
     voxels: bool
@@ -127,64 +102,54 @@ class ImportConfig:
 
 
 def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -> None:
-    """Read, convert, check and add a recording to a dataset.
+    """Read, convert, check and add a recording to a dataset; ``log`` receives the lines to print.
 
     If the recording has problems, nothing is written.
-
-    Args:
-        config: what to read and how.
-        log: receives the lines to print.
 
     Raises:
         UserError: files are missing or do not match, or the episode fails validation.
     """
     name = config.name or config.src.resolve().name
-    folder = config.out / config.split
-    imported = _other_shards(config, folder, name)
+    folder, turn = config.out / config.split, world_from_recording(config.up)
+    path = folder / f"recording-{name}.array_record"
+    imported = _other_shards(config, path, name)
     frames = read_recording(config.src, config.trajectory)[:: config.stride]
     rgb, depth, source_size = _read_images(config, frames)
-    width, height = depth.shape[2], depth.shape[1]
+    height, width = depth.shape[1:]
     half = 0.5 if config.pixel_centres == "integer" else 0.0
     intrinsics = np.array(config.intrinsics, np.float32) + np.array([0, 0, half, half], np.float32)
     scale = (width / source_size[0], height / source_size[1])
-    pose = world_from_recording(config.up) @ np.stack([f.world_from_camera for f in frames])
+    pose = turn @ np.stack([frame.world_from_camera for frame in frames])
     # Check the units before large depths are dropped, which could hide that they are wrong.
-    _refuse(check_depth(depth, str(config.src)), config, frames)
+    _refuse(checks.check_depth(depth, str(config.src)), config, frames)
     depth[depth > config.max_depth] = 0
-    voxels = read_voxels(
-        config.src, [frame.colour for frame in frames], world_from_recording(config.up)
-    )
+    voxels = read_voxels(config.src, [frame.colour for frame in frames], turn)
     if voxels is not None:
         _require_same_grid(folder, imported, voxels, config)
+    acts = planar_actions(pose)
     arrays = EpisodeArrays(
-        rgb,
-        depth,
-        resize_intrinsics(intrinsics, *scale),
-        pose,
-        planar_actions(pose),
-        voxels=voxels,
+        rgb, depth, resize_intrinsics(intrinsics, *scale), pose, acts, voxels=voxels
     )
     info = {"policy": "recorded", "stride": config.stride, "source": config.src.resolve().name}
     record = write_episode(arrays, name, name, info)
-    _refuse(check_episode(read_episode(record), str(config.src)), config, frames)
-    path = folder / f"recording-{name}.array_record"
-    write_shard(path, [record])
-    acts = arrays.actions is not None
-    imported.append(_Imported(describe_shard(path), len(frames), acts, voxels is not None))
-    settings = {
-        "made_by": "import",
-        "frames": {one.shard.file: one.frames for one in imported},
-        "actions": {one.shard.file: one.actions for one in imported},
-    }
-    if any(one.voxels for one in imported):
-        settings["voxels"] = {one.shard.file: one.voxels for one in imported}
-    total = sum(one.frames for one in imported)
-    write_manifest(
-        folder, Manifest(config.split, tuple(one.shard for one in imported), settings, total)
-    )
-    moves = "planar actions" if acts else "poses only (6 degrees of freedom)"
+    _refuse(checks.check_episode(read_episode(record), str(config.src)), config, frames)
+    shard = dataset.write_shard(path, [record])
+    imported.append(_Imported(shard, len(frames), acts is not None, voxels is not None))
+    _write_manifest(folder, imported)
+    moves = "poses only (6 degrees of freedom)" if acts is None else "planar actions"
     grids = "" if voxels is None else f", voxels of {voxels.grid.side}³ cells"
     log(f"{folder}: added {name}, {len(frames)} frames of {width}×{height} pixels, {moves}{grids}.")
+
+
+def _write_manifest(folder: Path, imported: list[_Imported]) -> None:
+    """List the shards, and which fields each contains; voxels only if there are any."""
+    settings: dict[str, Any] = {"made_by": "import"}
+    for field in ("frames", "actions", "voxels"):
+        values = {one.shard.file: getattr(one, field) for one in imported}
+        if field != "voxels" or any(values.values()):
+            settings[field] = values
+    shards, total = tuple(one.shard for one in imported), sum(one.frames for one in imported)
+    dataset.write_manifest(folder, dataset.Manifest(folder.name, shards, settings, total))
 
 
 def world_from_recording(up: str) -> np.ndarray:
@@ -205,34 +170,38 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     if len(world_from_camera) < 2:
         return None
     actions = np.asarray(actions_between(np.asarray(world_from_camera, np.float32)))
-    metres, radians = action_errors(world_from_camera, actions)
-    return actions if bool(((metres < ACTION_M) & (radians < ACTION_RAD)).all()) else None
+    metres, radians = checks.action_errors(world_from_camera, actions)
+    return (
+        actions
+        if bool(((metres < checks.ACTION_M) & (radians < checks.ACTION_RAD)).all())
+        else None
+    )
 
 
-def _other_shards(config: ImportConfig, folder: Path, name: str) -> list[_Imported]:
+def _other_shards(config: ImportConfig, replaced: Path, name: str) -> list[_Imported]:
     """Return the existing shards without the one to replace."""
+    folder = replaced.parent
     if not folder.exists():
         return []
-    file = f"recording-{name}.array_record"
-    if not (folder / MANIFEST).is_file():
+    if not (folder / dataset.MANIFEST).is_file():
         # A killed import leaves its shard, which is complete and checked because it was renamed.
         strays = sorted(folder.glob("recording-*.array_record"))
         if len(strays) < len([*folder.glob("*.array_record"), *folder.glob("*.json")]):
             raise UserError(
                 f"{folder} holds an unfinished collection; finish it, or give another --split."
             )
-        return [_inspect(path, describe_shard(path)) for path in strays if path.name != file]
+        return [_inspect(path, dataset.describe_shard(path)) for path in strays if path != replaced]
     # The shard to replace may be newer than the list, if an import was killed between the two.
-    manifest = read_manifest(folder, check_files=False)
+    manifest = dataset.read_manifest(folder, check_files=False)
     if manifest.settings.get("made_by") != "import":
         raise UserError(f"{folder} was made by `collect`; import into another --split or folder.")
-    if any(shard.file == file for shard in manifest.shards) and not config.overwrite:
+    kept = [shard for shard in manifest.shards if shard.file != replaced.name]
+    if len(kept) < len(manifest.shards) and not config.overwrite:
         raise UserError(
             f"{folder} already has an episode named {name}; give another --name or --overwrite."
         )
-    kept = [shard for shard in manifest.shards if shard.file != file]
     for shard in kept:
-        check_size(folder / shard.file, shard)
+        dataset.check_size(folder / shard.file, shard)
     frames, actions = manifest.settings["frames"], manifest.settings.get("actions", {})
     voxels = manifest.settings.get("voxels", {})  # not listed where no recording has any
     return [
@@ -243,9 +212,9 @@ def _other_shards(config: ImportConfig, folder: Path, name: str) -> list[_Import
     ]
 
 
-def _inspect(path: Path, shard: Shard) -> _Imported:
+def _inspect(path: Path, shard: dataset.Shard) -> _Imported:
     """Open a shard and return which fields it contains."""
-    episode = read_episode(read_record(path, 0), str(path))
+    episode = read_episode(dataset.read_record(path, 0), str(path))
     acts, grid = episode.actions is not None, episode.voxel_grid
     return _Imported(shard, episode.length, acts, grid is not None)
 
@@ -257,7 +226,7 @@ def _require_same_grid(
     for one in imported:
         if one.voxels:
             path = folder / one.shard.file
-            there = read_episode(read_record(path, 0), str(path)).voxel_grid
+            there = read_episode(dataset.read_record(path, 0), str(path)).voxel_grid
             assert isinstance(there, VoxelGrid)
             require_alike(there, voxels.grid, str(config.src / "voxels"))
             return
@@ -322,7 +291,9 @@ def _read(path: Path, flags: int) -> np.ndarray:
     return image
 
 
-def _refuse(problems: list[Problem], config: ImportConfig, frames: list[RecordedFrame]) -> None:
+def _refuse(
+    problems: list[checks.Problem], config: ImportConfig, frames: list[RecordedFrame]
+) -> None:
     """Raise UserError for the first problem, naming the depth image's file."""
     if not problems:
         return

@@ -9,6 +9,7 @@ another, drawn from the same seed and position, so the replacement depends only 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -51,11 +52,7 @@ class BadRecords:
         return tuple(self._reasons)
 
     def add(self, record: str, reason: str) -> None:
-        """Count a record that does not decode.
-
-        Args:
-            record: its name.
-            reason: the error message.
+        """Count a record that does not decode, with the error message.
 
         Raises:
             UserError: the limit is exceeded; the message names all these records.
@@ -100,56 +97,26 @@ class _Drawn:
     clip: Clip
 
 
+@dataclasses.dataclass(frozen=True)
 class _DrawClip(grain.transforms.RandomMap):
     """Map the number of a record to a clip; an episode that does not decode is replaced.
 
-    Args:
-        config: as for ``clips``.
-        source: the episodes.
-        features: as for ``clips``.
-        bad: as for ``clips``.
-        actions: whether batches have actions, because all episodes do.
-        grid: the grid that all episodes must have, if all episodes have voxels.
+    Batches have actions if all episodes do (``actions``), and voxels if all have the same ``grid``.
     """
 
-    def __init__(
-        self,
-        config: Config,
-        source: EpisodeSource,
-        features: ReadFeatures | None,
-        bad: BadRecords,
-        actions: bool = True,
-        grid: VoxelGrid | None = None,
-    ):
-        self.config, self.source, self.features, self.bad = config, source, features, bad
-        self.actions, self.grid = actions, grid
+    config: Config
+    source: EpisodeSource
+    features: ReadFeatures | None
+    bad: BadRecords
+    actions: bool = True
+    grid: VoxelGrid | None = None
 
-    def random_map(self, element: int, rng: np.random.Generator) -> Clip:
-        return self.draw(element, rng).clip
-
-    def draw(self, record: int, rng: np.random.Generator) -> _Drawn:
-        """Draw a clip.
-
-        Raises:
-            UserError: the episode does not fit the configuration, more records do not decode than
-                ``data.bad_records`` allows, or none does.
-        """
-        refused: set[int] = set()
+    def random_map(self, element: int, rng: np.random.Generator) -> _Drawn:
+        """Draw a clip from the record, or from another one if it does not decode."""
+        record, refused = element, set()
         while True:
             try:
-                episode = self.source[record]
-                _check_size(self.config, episode)
-                if self.grid is not None and episode.voxel_grid is not None:
-                    require_alike(self.grid, episode.voxel_grid, f"episode {episode.name}")
-                choice = choose(self.config, episode.length, rng, f"episode {episode.name}")
-                asked = self.config.model.batch_spec
-                slots = self.config.data.context
-                if not asked.context:
-                    slots, choice = 0, dataclasses.replace(choice, context_S=choice.context_S[:0])
-                voxels = self.grid is not None and "classes_TXYZ" in asked.names
-                clip = cut(episode, choice, slots, self.features, voxels=voxels)
-                if not self.actions:
-                    clip = dataclasses.replace(clip, actions_TA=None)
+                return self._draw(record, rng)
             except DamagedError as error:
                 self.bad.add(_name(self.source, record), str(error))
                 refused.add(record)
@@ -160,18 +127,21 @@ class _DrawClip(grain.transforms.RandomMap):
                     ) from None
                 while record in refused:
                     record = int(rng.integers(len(self.source)))
-                continue
-            return _Drawn(record, episode.name, choice, clip)
 
-
-class _DescribeClip(grain.transforms.RandomMap):
-    """Map the number of a record to the name of the clip that ``_DrawClip`` draws."""
-
-    def __init__(self, draw: _DrawClip):
-        self.draw = draw
-
-    def random_map(self, element: int, rng: np.random.Generator) -> str:
-        return _describe(self.draw.source, self.draw.draw(element, rng))
+    def _draw(self, record: int, rng: np.random.Generator) -> _Drawn:
+        episode = self.source[record]
+        _check_size(self.config, episode)
+        if self.grid is not None and episode.voxel_grid is not None:
+            require_alike(self.grid, episode.voxel_grid, f"episode {episode.name}")
+        choice = choose(self.config, episode.length, rng, f"episode {episode.name}")
+        asked, slots = self.config.model.batch_spec, self.config.data.context
+        if not asked.context:
+            slots, choice = 0, dataclasses.replace(choice, context_S=choice.context_S[:0])
+        voxels = self.grid is not None and "classes_TXYZ" in asked.names
+        clip = cut(episode, choice, slots, self.features, voxels=voxels)
+        if not self.actions:
+            clip = dataclasses.replace(clip, actions_TA=None)
+        return _Drawn(record, episode.name, choice, clip)
 
 
 def dataset(
@@ -205,30 +175,24 @@ def dataset(
     wanted = range(batch)[rows or slice(None)]
 
     def read(number: int) -> Clip:
-        return stack([cast("Clip", drawn[number * batch + row]) for row in wanted])
+        return stack([cast("_Drawn", drawn[number * batch + row]).clip for row in wanted])
 
     return grain.MapDataset.range(len(drawn) // batch).map(read)
 
 
 def records(config: Config, split: str = "train", *, seed: int, batch: int, step: int) -> list[str]:
-    """Name the clips of a batch, recomputed from its number.
+    """Name the clips of batch ``step``, recomputed from its number; arguments as for ``clips``.
 
-    Args:
-        config: as for ``clips``.
-        split: folder inside ``data.path``.
-        seed: as for ``clips``.
-        batch: clips per batch.
-        step: number of the batch, from 0; training uses it in step ``step + 1``.
+    Batches count from 0; training uses batch k in step k + 1.
 
     Returns:
         B names such as ``train/shard-00000-of-00004.array_record record 12 (episode house-3/follow)
         frames 3–11``; records that do not decode are replaced as in ``clips``.
     """
     source = EpisodeSource(Path(config.data.path) / split)
-    named = _order(source, seed).random_map(
-        _DescribeClip(_DrawClip(config, source, None, BadRecords()))
-    )
-    return [str(named[index]) for index in range(step * batch, (step + 1) * batch)]
+    drawn = _order(source, seed).random_map(_DrawClip(config, source, None, BadRecords()))
+    numbers = range(step * batch, (step + 1) * batch)
+    return [_describe(source, cast("_Drawn", drawn[number])) for number in numbers]
 
 
 def _order(source: EpisodeSource, seed: int) -> grain.MapDataset:
@@ -265,8 +229,9 @@ def clips(
 
     Returns:
         NumPy clips with a leading B (the number of rows): rgb uint8, depth float32 in metres,
-        actions if all episodes have them, and the extras that the model's ``batch_spec`` names if
-        all episodes have those.
+            actions if
+        all episodes have them, and the extras that the model's ``batch_spec`` names if all episodes
+        have those.
 
     Raises:
         UserError: the split is absent, unfinished or damaged, or its episodes do not fit, or (where
@@ -278,14 +243,7 @@ def clips(
 
 
 def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Episode:
-    """Compare the first episode that decodes with the configuration, before anything is compiled.
-
-    Returns:
-        That episode.
-
-    Raises:
-        UserError: it does not fit, or no episode decodes.
-    """
+    """Return the first episode that decodes, after comparing it with the configuration."""
     for record in range(len(source)):
         try:
             first = source[record]
@@ -301,11 +259,7 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
 
 
 def _require_known(config: Config) -> None:
-    """Raise an error if a world's loss needs recorded arrays that no episode has.
-
-    Raises:
-        ConfigError: its ``batch_spec`` has an unknown name.
-    """
+    """Raise ConfigError if a world's loss needs recorded arrays that no episode has."""
     unknown = sorted(set(config.model.batch_spec.names) - set(RECORDED))
     if unknown:
         raise ConfigError(
@@ -315,12 +269,7 @@ def _require_known(config: Config) -> None:
 
 
 def _in_all(source: EpisodeSource, first: Episode) -> tuple[bool, bool]:
-    """Return whether all episodes of a split have actions, and whether all have voxels.
-
-    Args:
-        source: the split.
-        first: its first episode.
-    """
+    """Return whether all episodes of a split have actions, and whether all have voxels."""
     actions, voxels = first.actions is not None, first.voxel_grid is not None
     settings = source.manifest.settings
     if settings.get("made_by") == "import":  # hand-held cameras among others
@@ -341,10 +290,8 @@ def _describe(source: EpisodeSource, drawn: _Drawn) -> str:
     frames = drawn.choice.frames_T
     stride = int(frames[1] - frames[0])
     every = f" by {stride}" if stride > 1 else ""
-    return (
-        f"{_name(source, drawn.record)} (episode {drawn.name}) frames {frames[0]}–{frames[-1]}"
-        f"{every}"
-    )
+    span = f"frames {frames[0]}–{frames[-1]}{every}"
+    return f"{_name(source, drawn.record)} (episode {drawn.name}) {span}"
 
 
 def _check_size(config: Config, episode: Episode) -> None:
@@ -377,30 +324,23 @@ def _check_actions(config: Config, episode: Episode) -> None:
 
 
 def require_same_cells(world: World, episode: Episode) -> None:
-    """Raise an error if an episode's voxel classes or images are not those that a world expects.
+    """Raise ConfigError if an episode's voxel classes or images are not those that a world expects.
 
-    Args:
-        world: its settings; worlds without a memory of kind ``grid`` accept any.
-        episode: an episode of the data. Class tables that ``collect`` did not make are not
-            compared.
-
-    Raises:
-        ConfigError: the episode has another table of classes, or other images.
+    Worlds without a memory of kind ``grid`` accept any. Class tables that ``collect`` did not make
+    are not compared.
     """
     memory: Any = getattr(world, "memory", None)
     if not getattr(memory, "CLASSES", False) or episode.voxel_grid is None:
         return
-    for kinds in ("all", "groups"):
-        for colours in range(1, len(PALETTE) + 1):
-            same = (kinds, colours) == (memory.kinds, memory.colours)
-            if not same and VoxelsConfig(kinds=kinds, colours=colours).names == (
-                episode.voxel_grid.names
-            ):
-                raise ConfigError(
-                    f"episode {episode.name} was collected with --voxels.kinds {kinds} "
-                    f"--voxels.colours {colours}, and memory.kinds is {memory.kinds}, memory."
-                    f"colours {memory.colours}: use the same."
-                )
+    for made in itertools.product(("all", "groups"), range(1, len(PALETTE) + 1)):
+        kinds, colours = made
+        names = VoxelsConfig(kinds=kinds, colours=colours).names
+        if made != (memory.kinds, memory.colours) and names == episode.voxel_grid.names:
+            raise ConfigError(
+                f"episode {episode.name} was collected with --voxels.kinds {kinds} "
+                f"--voxels.colours {colours}, and memory.kinds is {memory.kinds}, memory."
+                f"colours {memory.colours}: use the same."
+            )
     pictures = episode.info.get("pictures", "surfaces")
     if pictures != memory.pictures:
         raise ConfigError(

@@ -15,10 +15,9 @@ import tyro
 
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.config.launch import is_address
-from pewm_jax.data import voxel_pictures
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.moving import MovingHouse, moving_house, render_moving
-from pewm_jax.data.render import render
+from pewm_jax.data.render import draw_blocks, render
 from pewm_jax.data.simulator import HEADROOM_M, open_house, open_mesh
 from pewm_jax.data.trajectories import Policy, make_trajectory
 from pewm_jax.data.voxelise import record_voxels
@@ -108,9 +107,7 @@ class CollectConfig:
         for name in positive:
             if getattr(self, name) <= 0:
                 raise ConfigError(f"--{dashed(name)} is {getattr(self, name)}: use 1 or more.")
-        for name in ("train", "validation", "test", "workers", "seed"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"--{name} is {getattr(self, name)}: use 0 or more.")
+        require_at_least(self, 0, "train", "validation", "test", "workers", "seed")
         if max(self.train, self.validation, self.test) > HOUSES_PER_SEED:
             raise ConfigError(f"a split can hold at most {HOUSES_PER_SEED} episodes.")
         if self.train + self.validation + self.test == 0:
@@ -122,7 +119,12 @@ class CollectConfig:
         if self.frames < 2:
             raise ConfigError("--frames is 1: an episode needs at least 2 frames.")
         self._check_moving_and_voxels()
-        self._check_address()
+        if self.address and self.engine != "ray":
+            raise ConfigError(f"--address {self.address} needs --engine ray.")
+        if self.address not in ("", "auto") and not is_address(self.address):
+            raise ConfigError(
+                f"--address is {self.address!r}: use HOST:PORT (a port from 1 to 65535) or auto."
+            )
 
     def _check_moving_and_voxels(self) -> None:
         if self.moving and self.scene:
@@ -143,14 +145,6 @@ class CollectConfig:
             raise ConfigError(
                 "--ids records the instances of the house, which --voxels.pictures cells does not "
                 "show: leave out one of the two."
-            )
-
-    def _check_address(self) -> None:
-        if self.address and self.engine != "ray":
-            raise ConfigError(f"--address {self.address} needs --engine ray.")
-        if self.address not in ("", "auto") and not is_address(self.address):
-            raise ConfigError(
-                f"--address is {self.address!r}: use HOST:PORT (a port from 1 to 65535) or auto."
             )
 
     @property
@@ -201,11 +195,7 @@ def scenes_of(config: CollectConfig, split: str) -> tuple[Path, ...]:
 
 
 def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
-    """Make one episode and return its record.
-
-    Raises:
-        UserError: a mesh does not load or has no floor to stand on.
-    """
+    """Return the record of one episode; UserError if a mesh does not load or has no floor."""
     moving: MovingHouse | None = None
     if config.scene:
         scenes = scenes_of(config, split)
@@ -225,29 +215,29 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         turn_around=config.turn_around,
         continuous=config.continuous,
     )
-    intrinsics = intrinsics_from_fov(config.size, config.size, config.hfov)
     pose = walk.world_from_camera(grid.floor_z + config.camera_height)
-    camera = Camera(intrinsics, pose)
+    size = config.size, config.size
+    camera = Camera(intrinsics_from_fov(*size, config.hfov), pose)
     parts = None if moving is None else moving.poses(walk.planar_T3[:, :2])
     voxels = None
     if config.voxels.record:
         floor_z = float(grid.floor_z) if config.scene else 0.0
         voxels = record_voxels(config.voxels, scene, floor_z, pose[:, :3, 3], moving, parts)
     if voxels is not None and config.voxels.pictures == "cells":
-        seen = voxel_pictures.draw_blocks(voxels, camera, config.size, config.size)
+        seen = draw_blocks(voxels, camera, *size)
     elif moving is not None and parts is not None:
-        seen = render_moving(moving, parts, camera, config.size, config.size)
+        seen = render_moving(moving, parts, camera, *size)
     else:
-        seen = render(scene, camera, config.size, config.size)
+        seen = render(scene, camera, *size)
     arrays = EpisodeArrays(
-        rgb_THWC=seen.rgb_THWC,
-        depth_THW=seen.depth_THW,
-        intrinsics_4=intrinsics,
-        world_from_camera=pose,
-        actions=walk.actions,
-        action_ids=walk.action_ids,
-        ids_THW=seen.ids_THW if config.ids else None,
-        voxels=voxels,
+        seen.rgb_THWC,
+        seen.depth_THW,
+        camera.intrinsics_4,
+        pose,
+        walk.actions,
+        walk.action_ids,
+        seen.ids_THW if config.ids else None,
+        voxels,
     )
     info: dict[str, Any] = {
         "policy": policy,
@@ -279,3 +269,11 @@ def _moving(seed: int, camera_height: float) -> MovingHouse:
 def dashed(name: str) -> str:
     """Return a setting's name in its command-line form."""
     return name.replace("_", "-")
+
+
+def require_at_least(config: Any, least: int, *names: str) -> None:
+    """Raise ConfigError for settings below a number."""
+    for name in names:
+        value = getattr(config, name)
+        if value < least:
+            raise ConfigError(f"--{dashed(name)} is {value}: use {least} or more.")

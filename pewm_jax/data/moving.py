@@ -16,12 +16,12 @@ import dataclasses
 
 import numpy as np
 import trimesh
-from scipy import ndimage
 
 from pewm_jax.data.navigation import NavGrid, navigable, shortest_path
 from pewm_jax.data.render import Rendered, render
 from pewm_jax.data.scenes import Scene, from_trimesh, house
 from pewm_jax.houses.fixtures import LEAF_M, ROBOT_RADIUS_M, door_leaf, robot
+from pewm_jax.houses.floorplan import largest_region
 from pewm_jax.houses.shapes import Piece
 from pewm_jax.types import Camera
 
@@ -77,11 +77,9 @@ class MovingHouse:
     parts: Scene | None
 
     def poses(self, xy_T2: np.ndarray) -> np.ndarray:
-        """Return (T, P, 4, 4) world_from_part of all parts.
+        """Return (T, P, 4, 4) world_from_part of the parts for the agent's positions (T, 2), m.
 
-        Args:
-            xy_T2: (T, 2) positions of the agent, metres; the poses of frame t depend on the
-                positions up to t.
+        The poses of frame t depend on the positions up to t.
         """
         if not self.moves:
             return np.zeros((len(xy_T2), 0, 4, 4))
@@ -91,9 +89,7 @@ class MovingHouse:
 def moving_house(seed: int, agent_height_m: float) -> MovingHouse:
     """Return the generated house of a seed (that of ``scenes.house``) with doors and robots.
 
-    Args:
-        seed: seed of the house.
-        agent_height_m: the agent passes under obstacles above this height.
+    The agent passes under obstacles above ``agent_height_m``.
     """
     scene = house(seed)
     rng = np.random.default_rng([_STREAM, seed])
@@ -123,16 +119,11 @@ def parts_at(moving: MovingHouse, world_from_part_P44: np.ndarray) -> Scene:
 
 def part_at(moving: MovingHouse, number: int, world_from_part_44: np.ndarray) -> Scene:
     """Return one part alone as a scene, at a pose; the scene must not be rendered."""
-    assert moving.parts is not None
     poses = np.broadcast_to(world_from_part_44, (len(moving.moves), 4, 4))
-    whole, mine = _place_parts(moving.parts, poses), moving.parts.object_F == number
-    return dataclasses.replace(
-        whole,
-        faces_F3=whole.faces_F3[mine],
-        normals_F3=whole.normals_F3[mine],
-        object_F=whole.object_F[mine],
-        albedo_F3=whole.albedo_F3[mine],
-    )
+    whole = parts_at(moving, poses)
+    fields = ("faces_F3", "normals_F3", "object_F", "albedo_F3")
+    mine = whole.object_F == number
+    return dataclasses.replace(whole, **{name: getattr(whole, name)[mine] for name in fields})
 
 
 def render_moving(
@@ -140,15 +131,8 @@ def render_moving(
 ) -> Rendered:
     """Render T frames of a moving house: at each pixel the nearer of the static and moving parts.
 
-    Args:
-        moving: the house.
-        poses_TP44: (T, P, 4, 4) poses of its parts, from ``MovingHouse.poses``.
-        camera: (T,) cameras, as for ``render``.
-        height: image height in pixels.
-        width: image width in pixels.
-
-    Returns:
-        As ``render``; the ids of parts follow those of the scene's objects.
+    As ``render``, with the (T, P, 4, 4) poses of ``MovingHouse.poses``; the ids of parts follow
+    those of the scene's objects.
     """
     seen = render(moving.scene, camera, height, width)
     if moving.parts is None:
@@ -191,8 +175,7 @@ def _robot_path(
     draw = np.random.default_rng(rng.integers(1 << 30))
     if draw.uniform() > ROBOT_PROBABILITY:
         return None
-    rows, columns = np.indices(grid.free_YX.shape)
-    centres = grid.centre_of(np.stack([rows, columns], -1))
+    centres = grid.centres
     inside = ((centres > room[:2]) & (centres < room[2:])).all(-1)
     for *_, x0, y0, x1, y1 in doorways:
         middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
@@ -259,10 +242,10 @@ class DoorLeaf:
     """A leaf of a door.
 
     Attributes:
-        hinge_2: (2,) position of the hinge, metres.
+        hinge_2: position of the hinge, metres.
         yaw: direction of the closed leaf, from the hinge to its end, radians.
         swing: angle between closed and open, ± a right angle.
-        middle_2: (2,) middle of the doorway.
+        middle_2: middle of the doorway.
         stays: whether it stays open.
     """
 
@@ -324,19 +307,13 @@ def hang_leaves(
 
 def _clear_of(grid: NavGrid, leaves: list[DoorLeaf], width: float) -> NavGrid:
     """Return the largest free region outside the open leaves."""
-    rows, columns = np.indices(grid.free_YX.shape)
-    centres = grid.centre_of(np.stack([rows, columns], -1))
-    free = grid.free_YX.copy()
+    centres, free = grid.centres, grid.free_YX.copy()
     for leaf in leaves:
         way = np.array([np.cos(leaf.yaw + leaf.swing), np.sin(leaf.yaw + leaf.swing)])
         along = np.clip((centres - leaf.hinge_2) @ way, 0, width)
         near = leaf.hinge_2 + along[..., None] * way
         free &= np.linalg.norm(centres - near, axis=-1) > 0.3
-    labels = np.zeros(free.shape, np.int32)
-    ndimage.label(free, output=labels)
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return dataclasses.replace(grid, free_YX=(labels == sizes.argmax()) & free)
+    return dataclasses.replace(grid, free_YX=largest_region(free))
 
 
 def _has_room(scene: Scene, leaf: DoorLeaf, width: float) -> bool:

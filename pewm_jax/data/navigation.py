@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from pewm_jax.config import UserError
 from pewm_jax.data.scenes import Scene
+from pewm_jax.houses.floorplan import largest_region
 
 STEP_M = 0.12
 """Largest height difference on one floor, metres."""
@@ -53,6 +54,11 @@ class NavGrid:
         """Free area in square metres."""
         return float(self.free_YX.sum() * self.cell_m**2)
 
+    @property
+    def centres(self) -> np.ndarray:
+        """World centres (Y, X, 2) of all cells."""
+        return self.centre_of(np.moveaxis(np.indices(self.free_YX.shape), 0, -1))
+
 
 def navigable(
     scene: Scene,
@@ -88,22 +94,17 @@ def navigable(
     floor_z = estimate_floor(scene)
     x, y = (origin[i] + (np.arange(n) + 0.5) * cell_m for i, n in enumerate((columns, rows)))
     centres = np.stack(np.meshgrid(x, y), -1)
-    landing = _landing(scene, centres, floor_z + agent_height_m)
-    stand = np.abs(landing - floor_z) <= STEP_M
-    stand &= ~_obstructed(
-        scene, centres, stand, floor_z=floor_z, height_m=agent_height_m, cell_m=cell_m
-    )
+    stand = np.abs(_landing(scene, centres, floor_z + agent_height_m) - floor_z) <= STEP_M
+    heights = floor_z + agent_height_m * np.array(_HEIGHTS)
+    stand &= ~_obstructed(scene, centres, stand, heights, cell_m)
     away = np.asarray(ndimage.distance_transform_edt(np.pad(stand, 1)))[1:-1, 1:-1]
-    labels = np.zeros(stand.shape, np.int32)
-    ndimage.label((away - 0.5) * cell_m >= agent_radius_m, output=labels)
-    if not labels.any():
+    region = largest_region((away - 0.5) * cell_m >= agent_radius_m)
+    if not region.any():
         raise UserError(
             f"{scene.name} has no place where an agent of radius {agent_radius_m} m can stand "
             f"(floor found at z = {floor_z:.2f} m): check that it is in metres and z is up."
         )
-    sizes = np.bincount(labels.ravel())
-    sizes[0] = 0
-    return NavGrid(labels == sizes.argmax(), origin, cell_m, floor_z)
+    return NavGrid(region, origin, cell_m, floor_z)
 
 
 def estimate_floor(scene: Scene, bin_m: float = 0.1) -> float:
@@ -138,29 +139,18 @@ def _landing(scene: Scene, centres_YX2: np.ndarray, start_z: float) -> np.ndarra
 
 
 def _obstructed(
-    scene: Scene,
-    centres_YX2: np.ndarray,
-    stand_YX: np.ndarray,
-    *,
-    floor_z: float,
-    height_m: float,
-    cell_m: float,
+    scene: Scene, centres_YX2: np.ndarray, stand_YX: np.ndarray, z: np.ndarray, cell_m: float
 ) -> np.ndarray:
-    """Return the (Y, X) cells in which a short ray along +x or +y hits something."""
+    """Return the (Y, X) cells in which a short ray along +x or +y at some height hits something."""
     points = centres_YX2[stand_YX]
     blocked = np.zeros(len(points), bool)
-    z = floor_z + height_m * np.array(_HEIGHTS)
     for axis in (0, 1):
-        direction = np.zeros((1, 3), np.float32)
-        direction[0, axis] = 1.0
-        starts = np.concatenate(
-            [np.repeat(points, len(z), 0), np.tile(z, len(points))[:, None]], axis=1
-        )
+        starts = np.column_stack([np.repeat(points, len(z), 0), np.tile(z, len(points))])
         # Rays of neighbours overlap a little, so a wall on the border of two cells is hit.
         starts[:, axis] -= 0.52 * cell_m
         starts = (starts - scene.centre_3).astype(np.float32)
         reach = np.full(len(starts), 1.04 * cell_m, np.float32)
-        rays = np.tile(direction, (len(starts), 1))
+        rays = np.tile(np.eye(3, dtype=np.float32)[axis], (len(starts), 1))
         hit = scene.tracer.run(starts, rays, dists=reach, query="OCCLUDED") >= 0
         blocked |= hit.reshape(-1, len(z)).any(1)
     result = np.zeros_like(stand_YX)
@@ -207,12 +197,9 @@ def shortest_path(grid: NavGrid, start_xy: np.ndarray, goal_xy: np.ndarray) -> n
 
 
 class PathsToGoal:
-    """The shortest paths from all cells to one goal; computed once, then looked up.
+    """The shortest paths from all cells to one goal (2,); computed once, then looked up.
 
-    Attributes:
-        grid: the cells where the agent can stand.
-        goal_xy: (2,) the goal, metres.
-        distance_YX: (Y, X) metres to the goal from cell to cell, as ``distance_field``.
+    ``distance_YX`` are metres to the goal from cell to cell, as ``distance_field``.
     """
 
     def __init__(self, grid: NavGrid, goal_xy: np.ndarray):
@@ -222,10 +209,8 @@ class PathsToGoal:
     def path(self, start_xy: np.ndarray) -> np.ndarray | None:
         """Return (N, 2) world points from a start to the goal around obstacles.
 
-        Corners of the path are pulled tight wherever the straight line is free.
-
-        Returns:
-            The polyline, or None if start or goal is not in a free cell.
+        Corners of the path are pulled tight wherever the straight line is free. None if start or
+        goal is not in a free cell.
         """
         grid, ends = self.grid, np.stack([np.asarray(start_xy, float), self.goal_xy])
         if not is_free(grid, ends).all():
@@ -253,15 +238,6 @@ def line_is_free(grid: NavGrid, start_xy: np.ndarray, end_xy: np.ndarray) -> boo
     length = float(np.linalg.norm(np.asarray(end_xy) - np.asarray(start_xy)))
     steps = np.linspace(0, 1, max(2, int(np.ceil(length / (0.25 * grid.cell_m))) + 1))[:, None]
     return bool(is_free(grid, np.asarray(start_xy) + steps * (end_xy - start_xy)).all())
-
-
-def rooms_reached(grid: NavGrid, rooms: list[list[float]]) -> list[bool]:
-    """Return for each room rectangle [x0, y0, x1, y1] whether some free cell lies in it."""
-    centres = grid.centre_of(np.argwhere(grid.free_YX))
-    return [
-        bool((((x0, y0) < centres) & (centres < (x1, y1))).all(-1).any())
-        for x0, y0, x1, y1 in rooms
-    ]
 
 
 def _dijkstra(grid: NavGrid, source_xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -293,16 +269,15 @@ def _graph(grid: NavGrid) -> csr_matrix:
 
 def _pull_tight(grid: NavGrid, points_N2: np.ndarray) -> np.ndarray:
     """Drop the waypoints between points that a straight line through free cells can join."""
-    kept, at = [points_N2[0]], 0
-    while at < len(points_N2) - 1:
-        low, high = at + 1, len(points_N2) - 1
+    kept, at, last = [points_N2[0]], 0, len(points_N2) - 1
+    while at < last:
         reach = 1
-        while at + reach < high and line_is_free(
-            grid, points_N2[at], points_N2[min(high, at + 2 * reach)]
+        while at + reach < last and line_is_free(
+            grid, points_N2[at], points_N2[min(last, at + 2 * reach)]
         ):
             reach *= 2
-        ahead = min(high, at + 2 * reach)
-        while ahead > low and not line_is_free(grid, points_N2[at], points_N2[ahead]):
+        ahead = min(last, at + 2 * reach)
+        while ahead > at + 1 and not line_is_free(grid, points_N2[at], points_N2[ahead]):
             ahead -= 1
         at = ahead
         kept.append(points_N2[at])

@@ -16,21 +16,6 @@ from pewm_jax.config import UserError
 
 MAGIC = b"PEWMEPIS"
 VERSION = 1
-FIELDS = (
-    "format",
-    "version",
-    "name",
-    "scene",
-    "frames",
-    "height",
-    "width",
-    "units",
-    "conventions",
-    "info",
-    "arrays",
-    "streams",
-)
-"""Required fields of a header."""
 
 CONVENTIONS = {
     "camera": "OpenCV axes: x right, y down, z forward",
@@ -49,6 +34,24 @@ UNITS = {
     "intrinsics": "pixel",
     "actions": "metre, metre, radian",
 }
+
+
+def new_header(
+    name: str, scene: str, shape_THW: tuple[int, int, int], info: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the header of an episode without arrays and streams; it has all required fields."""
+    return {
+        "format": "pewm-episode",
+        "version": VERSION,
+        "name": name,
+        "scene": scene,
+        **dict(zip(("frames", "height", "width"), shape_THW, strict=True)),
+        "units": UNITS,
+        "conventions": CONVENTIONS,
+        "info": dict(info),
+        "arrays": {},
+        "streams": {},
+    }
 
 
 class DamagedError(UserError):
@@ -87,20 +90,14 @@ def pack_record(
 ) -> bytes:
     """Concatenate header, arrays and images; offsets count from the end of the header.
 
-    Args:
-        header: without ``arrays`` and ``streams``, which are filled in.
-        arrays: the arrays by field.
-        streams: the encoded images, or grids, of each frame, by stream.
-        about: header entries of the streams that are not PNG images.
+    ``arrays`` and ``streams`` of the header are filled in. A stream has the encoded images, or
+    grids, of each frame; ``about`` has header entries of the streams that are not PNG images.
     """
     blobs: list[bytes] = []
     offset = 0
     for field, array in arrays.items():
-        header["arrays"][field] = {
-            "offset": offset,
-            "dtype": array.dtype.str,
-            "shape": list(array.shape),
-        }
+        place = {"offset": offset, "dtype": array.dtype.str, "shape": list(array.shape)}
+        header["arrays"][field] = place
         blobs.append(array.tobytes())
         offset += array.nbytes
     for stream, images in streams.items():
@@ -109,11 +106,8 @@ def pack_record(
             spans.append([offset, len(image)])
             blobs.append(image)
             offset += len(image)
-        header["streams"][stream] = {
-            "codec": "png",
-            **(about or {}).get(stream, {}),
-            "spans": spans,
-        }
+        own = (about or {}).get(stream, {})
+        header["streams"][stream] = {"codec": "png", **own, "spans": spans}
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     return b"".join([MAGIC, struct.pack("<I", len(text)), text, *blobs])
 
@@ -127,11 +121,7 @@ def _absolute(header: dict[str, Any], payload: int) -> dict[str, Any]:
 
 
 def check_span(record: bytes, offset: int, size: int, where: str, field: str) -> None:
-    """Raise an error if a record ends before a field does.
-
-    Raises:
-        DamagedError: the record is truncated.
-    """
+    """Raise DamagedError if a record ends before a field does."""
     if offset + size > len(record):
         raise DamagedError(
             f"{where}, field {field}: the record ends after {len(record)} bytes but the field "
@@ -157,7 +147,8 @@ def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
         header = json.loads(record[start : start + length])
         version = header["version"]
         if version == VERSION:
-            header = _absolute({field: header[field] for field in FIELDS}, start + length)
+            required = new_header("", "", (0, 0, 0), {})
+            header = _absolute({field: header[field] for field in required}, start + length)
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError):
         raise DamagedError(
             f"{where}: the episode's header does not parse; the record is damaged, collect or "

@@ -20,8 +20,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from pewm_jax.config import UserError
 from pewm_jax.data.voxels import SIDE_LIMIT, VoxelFrames
 from pewm_jax.io.progress import Meter
+from pewm_jax.io.store import DAMAGED
 
 COLOUR_FOLDERS = ("image", "color", "colour", "rgb")
 DEPTH_FOLDERS = ("depth",)
@@ -41,13 +40,7 @@ TUM_TOLERANCE_S = 0.02
 
 @dataclasses.dataclass(frozen=True)
 class RecordedFrame:
-    """One frame of a recording.
-
-    Attributes:
-        colour: path of the colour image.
-        depth: path of the depth image.
-        world_from_camera: (4, 4) float64 camera-to-world in the recording's own world.
-    """
+    """One frame: paths of its images, and its float64 pose (4, 4) in the recording's own world."""
 
     colour: Path
     depth: Path
@@ -140,11 +133,9 @@ def _require_same_numbers(folder: Path, colours: list[Path], depths: list[Path])
 
 
 def _numbers(files: list[Path], place: int) -> list[int] | None:
-    """Return one number per name; None if a name has none, or two names share one.
+    """Return the first (0) or last (−1) number of each name.
 
-    Args:
-        files: the files.
-        place: index of the number among those in a name.
+    None if one has none or two share one.
     """
     found = [re.findall(r"[0-9]+", path.stem) for path in files]
     numbers = [int(each[place]) for each in found if each]
@@ -166,11 +157,7 @@ def _images(folder: Path, names: tuple[str, ...], what: str) -> list[Path]:
 
 
 def read_log(path: Path) -> np.ndarray:
-    """Read an Open3D ``.log`` trajectory as (T, 4, 4) camera-to-world.
-
-    Raises:
-        UserError: it does not parse; the message names the line.
-    """
+    """Read an Open3D ``.log`` trajectory as (T, 4, 4) poses; UserError names a bad line."""
     lines = [(i, line.split()) for i, line in enumerate(_lines(path), 1) if line.strip()]
     if len(lines) % 5:
         raise UserError(
@@ -185,16 +172,16 @@ def read_log(path: Path) -> np.ndarray:
 
 
 def _read_tum(folder: Path, trajectory: Path) -> list[RecordedFrame]:
-    colours, depths = (_stamped(folder / name) for name in ("rgb.txt", "depth.txt"))
-    poses = [(stamp, fields, number) for number, stamp, fields in _stamped_lines(trajectory)]
-    depth_times, pose_times = (np.array([row[0] for row in rows]) for rows in (depths, poses))
+    colours, depths = (_listed(folder / name) for name in ("rgb.txt", "depth.txt"))
+    poses = _stamped_lines(trajectory)
+    depth_times, pose_times = (np.array([row[1] for row in rows]) for rows in (depths, poses))
     frames = []
-    for stamp, name in colours:
+    for _, stamp, (name, *_) in colours:
         depth, pose = _nearest(depth_times, stamp), _nearest(pose_times, stamp)
         if depth is not None and pose is not None:
-            _, fields, number = poses[pose]
+            number, _, fields = poses[pose]
             matrix = _from_quaternion(trajectory, number, fields)
-            frames.append(RecordedFrame(folder / name, folder / depths[depth][1], matrix))
+            frames.append(RecordedFrame(folder / name, folder / depths[depth][2][0], matrix))
     if not frames:
         raise UserError(
             f"{folder}: no colour image of rgb.txt has a depth image and a pose within "
@@ -210,14 +197,14 @@ def _nearest(times: np.ndarray, stamp: float) -> int | None:
     return index if abs(times[index] - stamp) <= TUM_TOLERANCE_S else None
 
 
-def _stamped(path: Path) -> list[tuple[float, str]]:
+def _listed(path: Path) -> list[tuple[int, float, list[str]]]:
+    """Return the lines of a list of images: number, time stamp, and name first of the rest."""
     if not path.is_file():
         raise UserError(f"{path} does not exist; a TUM recording lists its images there.")
-    rows = []
-    for number, stamp, fields in _stamped_lines(path):
+    rows = _stamped_lines(path)
+    for number, _, fields in rows:
         if not fields:
             raise UserError(f"{path}, line {number}: a time stamp without a file name.")
-        rows.append((stamp, fields[0]))
     return rows
 
 
@@ -262,22 +249,15 @@ def _floats(path: Path, line: int, fields: list[str], count: int) -> np.ndarray:
 
 FOLDER, TABLE = "voxels", "classes.json"
 FIELDS = ("classes", "origin", "cell")
-_UNREADABLE = (EOFError, KeyError, OSError, ValueError, zipfile.BadZipFile, zlib.error)
-"""Errors that NumPy raises for files that are not ``.npz``, are truncated, or hold pickles."""
 
 
 def read_voxels(
     recording: Path, colours: Sequence[Path], world_from_recording: np.ndarray
 ) -> VoxelFrames | None:
-    """Read the grids of a recording's frames, rotated with its world.
+    """Read the grids of a recording's frames, given their colour images, rotated with its world.
 
-    Args:
-        recording: the folder.
-        colours: the colour images of the frames.
-        world_from_recording: (4, 4) rotation by right angles from the recording's axes to ours.
-
-    Returns:
-        The grids, or None if there is no folder ``voxels/``.
+    ``world_from_recording`` is a (4, 4) rotation by right angles from the recording's axes to ours.
+    None if there is no folder ``voxels/``.
 
     Raises:
         UserError: a frame's file is missing or cannot be read, the grids have different sides or
@@ -320,16 +300,11 @@ def read_voxels(
 def turned(
     classes_XYZ: np.ndarray, origin_3: np.ndarray, cell_m: float, rotation_33: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate a grid about the world's origin by right angles.
+    """Rotate a grid (n, n, n) about the world's origin by right angles.
 
-    Args:
-        classes_XYZ: (n, n, n) the cells.
-        origin_3: lowest corner of the grid, metres.
-        cell_m: side of a cell, metres.
-        rotation_33: a signed permutation of the axes, from the old to the new.
-
-    Returns:
-        The cells along the new axes, and the grid's lowest corner.
+    ``origin_3`` is its lowest corner, ``cell_m`` the side of a cell, metres; the rotation is a
+    signed permutation of the axes, from the old to the new. Return the cells along the new axes,
+    and the grid's lowest corner.
     """
     exact = np.rint(rotation_33).astype(int)
     order = np.abs(exact).argmax(1)  # new axis k is old axis order[k]
@@ -364,7 +339,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray, float]:
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             classes, origin, cell = (np.asarray(file[field]) for field in FIELDS)
-    except _UNREADABLE as error:
+    except (OSError, *DAMAGED) as error:
         raise UserError(
             f"{path} cannot be read as a grid ({' '.join(str(error).split())[:120]}): write the "
             f"arrays {', '.join(FIELDS)} with numpy.savez_compressed."

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import struct
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,22 +24,6 @@ from pewm_jax.houses.generate import generate_house
 
 if TYPE_CHECKING:
     from embreex.rtcore_scene import EmbreeScene
-
-_UNREADABLE = (
-    ArithmeticError,
-    AssertionError,
-    AttributeError,
-    EOFError,
-    ImportError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    TypeError,
-    ValueError,
-    struct.error,
-    zlib.error,
-)
-"""Errors that trimesh's parsers raise for files that they cannot read."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -99,10 +81,8 @@ def house(seed: int) -> Scene:
 def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
     """Read a mesh file of any kind that trimesh loads (GLB, OBJ, PLY, STL, …).
 
-    Args:
-        path: the file.
-        up: which axis of the file points up; ``auto`` is y for glTF, as in its specification, and
-            z for all others.
+    ``up`` is the axis of the file that points up; ``auto`` is y for glTF, as in its specification,
+    and z for all others.
 
     Raises:
         UserError: the file is absent or unreadable, or holds no usable triangles.
@@ -112,11 +92,12 @@ def load_scene(path: Path, up: Literal["auto", "z", "y"] = "auto") -> Scene:
         raise UserError(f"{path} is not a file: give the path of a mesh (GLB, OBJ, PLY, …).")
     try:
         loaded = trimesh.load_scene(path)
-    except _UNREADABLE as error:
+    except Exception as error:  # trimesh's parsers raise many kinds for files they cannot read
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise UserError(
-            f"{path} could not be read as a mesh ({_one_line(error)}): check that the file is "
-            "complete and of a kind that trimesh loads (GLB, OBJ, PLY, …)."
-        ) from None
+            f"{path} could not be read as a mesh ({reason}): check that the file is complete and "
+            "of a kind that trimesh loads (GLB, OBJ, PLY, …)."
+        ) from error
     if up == "auto":
         up = "y" if path.suffix.lower() in {".glb", ".gltf"} else "z"
     return from_trimesh(loaded, path.stem, up, where=str(path))
@@ -129,17 +110,13 @@ def from_trimesh(
     *,
     where: str | None = None,
 ) -> Scene:
-    """Convert a trimesh scene, with its instances, textures and colours, to a `Scene`.
+    """Convert a trimesh scene in metres, with its instances, textures and colours, to a `Scene`.
 
     Meshes of one colour (grey if they have none) are shaded by the direction of each face. Textures
     and vertex colours are kept as they are, because scans contain their own light. A scene whose
-    metadata says ``shading: soft`` gets light and ambient occlusion baked everywhere.
-
-    Args:
-        scene: meshes in metres; entries that are not triangle meshes are left out.
-        name: name of the result.
-        up: axis that points up; y is turned to z.
-        where: name of the scene in error messages; ``name`` by default.
+    metadata says ``shading: soft`` gets light and ambient occlusion baked everywhere. Entries that
+    are not triangle meshes are left out. If y points up, it is turned to z. Errors name the scene
+    by ``where``, or by its name.
 
     Raises:
         UserError: there are no triangles, or vertices are not finite.
@@ -193,27 +170,25 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
     """Concatenate instances, bake light and lay out the shading rows."""
     starts = np.cumsum([0] + [len(part.vertices_V3) for part in parts[:-1]])
     vertices = np.concatenate([part.vertices_V3 for part in parts])
-    faces = np.concatenate(
-        [part.surface.faces_F3 + start for part, start in zip(parts, starts, strict=True)]
-    ).astype(np.int32)
+    placed = [part.surface.faces_F3 + start for part, start in zip(parts, starts, strict=True)]
+    faces = np.concatenate(placed).astype(np.int32)
     counts = [len(part.surface.faces_F3) for part in parts]
+
+    def per_face(values: list[Any]) -> np.ndarray:
+        return np.repeat(np.array(values), counts)
+
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     double_area = np.linalg.norm(cross, axis=-1, keepdims=True)
-    facing = np.repeat([-1.0 if part.mirrored else 1.0 for part in parts], counts)
+    facing = per_face([-1.0 if part.mirrored else 1.0 for part in parts])
     normals = cross / double_area.clip(1e-12) * facing[:, None]
     colour = np.concatenate([part.surface.colour_F33 for part in parts])
     uv = np.concatenate([part.surface.uv_F32 for part in parts])
-    images: list[np.ndarray] = [np.full((1, 1, 3), 255, np.uint8)]
-    rows: dict[int, int] = {}
-    image_of_part = []
-    for part in parts:
-        image = part.surface.image
-        if image is not None and id(image) not in rows:
-            rows[id(image)] = len(images)
-            images.append(image)
-        image_of_part.append(0 if image is None else rows[id(image)])
-    texture = np.repeat(np.array(image_of_part, np.int32) * LEVELS, counts)
+    white = np.full((1, 1, 3), 255, np.uint8)
+    image_of_part = [white if p.surface.image is None else p.surface.image for p in parts]
+    images = list({id(image): image for image in [white, *image_of_part]}.values())
+    rows = {id(image): row for row, image in enumerate(images)}
+    texture = per_face([rows[id(image)] for image in image_of_part]).astype(np.int32) * LEVELS
     textures = pack(images)
     size = np.stack([textures.width_L[texture], textures.height_L[texture]], -1)
     edges = (uv[:, 1:] - uv[:, :1]) * size[:, None, :]
@@ -224,7 +199,7 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
         vertices_V3=vertices,
         faces_F3=faces,
         normals_F3=normals,
-        object_F=np.repeat(np.arange(len(parts), dtype=np.int32), counts),
+        object_F=per_face(list(range(len(parts)))).astype(np.int32),
         objects=tuple(part.node for part in parts),
         shading_16F=np.zeros((16, len(faces)), np.float32),
         texture_F=texture,
@@ -232,11 +207,11 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
         albedo_F3=_albedo(parts),
         metadata=metadata,
     )
-    bare = np.repeat(np.array([part.surface.bare for part in parts]), counts)
+    bare = per_face([part.surface.bare for part in parts])
     if soft:
         centred = vertices - scene.centre_3
         light = shading.soft_light(scene.tracer, centred, faces, normals)
-        light[np.repeat([part.surface.glowing for part in parts], counts)] = 1.0
+        light[per_face([part.surface.glowing for part in parts])] = 1.0
         colour = colour * light
     elif bare.any():
         light = shading.face_light(normals)[:, None, :]
@@ -252,16 +227,10 @@ def _assemble(parts: list[_Part], name: str, soft: bool, metadata: dict[str, Any
 def _albedo(parts: list[_Part]) -> np.ndarray:
     """Return (F, 3) float32 mean colours of faces; for an image, the mean of the whole image."""
     found = []
-    for part in parts:
-        image = part.surface.image
-        whole = 1.0 if image is None else image.mean((0, 1)) / 255
-        found.append(part.surface.colour_F33.mean(1) * whole)
+    for surface in (part.surface for part in parts):
+        whole = 1.0 if surface.image is None else surface.image.mean((0, 1)) / 255
+        found.append(surface.colour_F33.mean(1) * whole)
     return np.concatenate(found).astype(np.float32)
-
-
-def _one_line(error: BaseException) -> str:
-    """Return an exception as a short single line."""
-    return " ".join(str(error).split())[:160] or type(error).__name__
 
 
 GREY = np.array([170, 170, 170], np.uint8)
@@ -328,12 +297,12 @@ def read_surface(mesh: trimesh.Trimesh, where: str) -> Surface:
         glow = getattr(visual.material, "emissiveFactor", None)
         glowing = glow is not None and float(np.max(glow)) > 0
         return Surface(vertices, faces, colour, uv, image, bare, glowing)
-    if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
-        colours = np.asarray(visual.vertex_colors)[:, :3].astype(np.float32) / 255
-        return Surface(vertices, faces, colours[faces], uv, None, bare=False)
-    if isinstance(visual, ColorVisuals) and visual.kind == "face":
-        colours = np.asarray(visual.face_colors)[:, :3].astype(np.float32) / 255
-        return Surface(vertices, faces, colour * colours[:, None], uv, None, bare=False)
+    if isinstance(visual, ColorVisuals) and visual.kind in ("vertex", "face"):
+        by_vertex = visual.kind == "vertex"
+        rgba = visual.vertex_colors if by_vertex else visual.face_colors
+        rgb = np.asarray(rgba)[:, :3].astype(np.float32) / 255
+        colour = rgb[faces] if by_vertex else colour * rgb[:, None]
+        return Surface(vertices, faces, colour, uv, None, bare=False)
     return Surface(vertices, faces, colour * np.float32(GREY / 255), uv, None, bare=True)
 
 

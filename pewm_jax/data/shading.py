@@ -33,8 +33,7 @@ class Textures:
     Attributes:
         texels_P4: uint8 RGB and padding, every level of every image, row-major.
         offset_L: (images × LEVELS,) int32, first texel of a level.
-        width_L: (images × LEVELS,) int32, texels in a row of a level.
-        height_L: (images × LEVELS,) int32, rows of a level.
+        width_L: int32, texels in a row of a level; ``height_L`` are its rows.
     """
 
     texels_P4: np.ndarray
@@ -44,11 +43,7 @@ class Textures:
 
 
 def pack(images: list[np.ndarray]) -> Textures:
-    """Build mip chains and concatenate them.
-
-    Args:
-        images: (H, W, 3) uint8 each, first row on top.
-    """
+    """Build mip chains of (H, W, 3) uint8 images, first row on top, and concatenate them."""
     parts, offsets, sizes, total = [], [], [], 0
     for image in images:
         level = np.ascontiguousarray(image)
@@ -71,16 +66,15 @@ def pack(images: list[np.ndarray]) -> Textures:
 
 
 def sample(textures: Textures, level_P: np.ndarray, s_P: np.ndarray, t_P: np.ndarray) -> np.ndarray:
-    """Sample colours bilinearly, repeating at the borders.
+    """Sample colours bilinearly, repeating at the borders, as (3, P) float32 in [0, 255].
+
+    Channels come first, because contiguous rows are faster.
 
     Args:
         textures: the scene's images.
         level_P: int32 row of the level table (image × LEVELS + level).
         s_P: float32, 0 → 1 from the left to the right border of the image.
         t_P: float32, 0 → 1 from the top to the bottom border.
-
-    Returns:
-        (3, P) float32 in [0, 255]; channels first, because contiguous rows are faster.
     """
     width, height = textures.width_L.take(level_P), textures.height_L.take(level_P)
     x0, x1, right = _neighbours(s_P, width)
@@ -136,11 +130,7 @@ LIFT_M = 0.04
 
 
 def require_embree() -> None:
-    """Raise an error if Embree cannot be imported; it has no wheels for some processors.
-
-    Raises:
-        UserError: it cannot be imported.
-    """
+    """Raise UserError if Embree cannot be imported; it has no wheels for some processors."""
     try:
         import embreex.rtcore_scene  # noqa: F401, PLC0415 - only rendering needs it
     except ImportError as error:
@@ -151,11 +141,7 @@ def require_embree() -> None:
 
 
 def embree(vertices_V3: np.ndarray, faces_F3: np.ndarray) -> EmbreeScene:
-    """Build Embree's acceleration structure over a triangle mesh.
-
-    Raises:
-        UserError: Embree is not installed.
-    """
+    """Build Embree's structure over a triangle mesh; UserError if it is not installed."""
     require_embree()
     from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415
     from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415
@@ -177,13 +163,9 @@ def face_light(normals_F3: np.ndarray) -> np.ndarray:
 def occlusion(
     tracer: EmbreeScene, points_P3: np.ndarray, normals_P3: np.ndarray, reach_m: float = 1.2
 ) -> np.ndarray:
-    """Return the (P,) openness of points in [0, 1]; 1 means that nothing is within reach.
+    """Return the (P,) openness of points in [0, 1]; 1 means that nothing is within ``reach_m``.
 
-    Args:
-        tracer: Embree's structure of the scene.
-        points_P3: points on surfaces, in the tracer's coordinates.
-        normals_P3: unit normals.
-        reach_m: the longest occlusion ray, metres.
+    The points on surfaces are in the tracer's coordinates; the normals have length 1.
     """
     count = len(points_P3)
     k = np.arange(RAYS)
@@ -207,11 +189,8 @@ def soft_light(
 ) -> np.ndarray:
     """Return (F, 3, 3) baked RGB light at the corners of every face.
 
-    Args:
-        tracer: Embree's structure of the scene, in the coordinates of ``vertices_V3``.
-        vertices_V3: vertices, not shared across hard edges.
-        faces_F3: vertex indices.
-        normals_F3: unit face normals.
+    The vertices are in the tracer's coordinates and not shared across hard edges; the normals have
+    length 1.
     """
     centroid = vertices_V3[faces_F3].mean(1)
     index, size = faces_F3.ravel(), len(vertices_V3)

@@ -3,26 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import cv2
+import jax
 import numpy as np
 import tyro
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
-from pewm_jax.data.voxel_pictures import grid_from_above, grid_from_camera
+from pewm_jax.data.voxels import VoxelFrames, measured_points, table_colours
+from pewm_jax.geometry.march import through_pixels
 from pewm_jax.io import atomic
+from pewm_jax.types import Camera, Frames
 
 THUMB = 128
 """Height of a thumbnail, pixels."""
 MARGIN = 8
 CEILING_M = 0.6
 """Points this far above the camera are omitted from the view from above, metres."""
-BACKGROUND, FREE = 24, 70
+BACKGROUND = 24
+"""Grey level of the background of images."""
+LIGHT = np.array([0.85, 0.7, 1.0, 0.5])
+"""Brightness of faces perpendicular to x, y and z, and of the cell in which a ray begins."""
+ABOVE_M = 0.5
+"""Cells this far above the camera (ceilings) are omitted from the view from above, metres."""
+PIXELS = 8
+"""Pixels along the side of a cell in the view from above."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,11 +63,7 @@ class ShowConfig:
 
 
 def show(config: ShowConfig, log: Callable[[str], None] = print) -> None:
-    """Draw an episode and write the image.
-
-    Raises:
-        UserError: the split cannot be read, or has no such episode.
-    """
+    """Draw an episode and write the image; UserError if there is no such episode."""
     source = EpisodeSource(config.path)
     if not 0 <= config.episode < len(source):
         raise UserError(
@@ -64,38 +71,47 @@ def show(config: ShowConfig, log: Callable[[str], None] = print) -> None:
             f"0 to {len(source) - 1}."
         )
     episode = source[config.episode]
-    if config.voxels:
-        picture = draw_voxels(episode, config.columns, config.rows)
-    else:
-        picture = draw(episode, config.columns, config.rows)
+    picture = (draw_voxels if config.voxels else draw)(episode, config.columns, config.rows)
     config.out.parent.mkdir(parents=True, exist_ok=True)
     done, code = cv2.imencode(".png", picture[..., ::-1])
     assert done
-    with atomic.replacing(config.out) as partial:
-        partial.write_bytes(code.tobytes())
+    atomic.write_bytes(config.out, code.tobytes())
     log(f"{config.out}: {episode.name} in {episode.scene}, {episode.length} frames.")
 
 
 def draw(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:
     """Return an RGB image: rows of colour and depth, and below them the view from above."""
-    count = min(columns * rows, episode.length)
-    chosen = np.round(np.linspace(0, episode.length - 1, count)).astype(int)
-    frames = episode.frames(chosen)
-    width = max(1, round(THUMB * episode.width / episode.height))
-    farthest = max(float(frames.depth_THW.max()), 1e-3)
-    sheet_rows = []
-    for start in range(0, count, columns):
-        part = range(start, min(start + columns, count))
-        colour = [_thumb(frames.rgb_THWC[i], width, str(chosen[i])) for i in part]
-        depth = [_thumb(depth_colours(frames.depth_THW[i], farthest), width) for i in part]
-        blank = [np.full((THUMB, width, 3), BACKGROUND, np.uint8)] * (columns - len(part))
-        sheet_rows += [np.hstack(colour + blank), np.hstack(depth + blank)]
-    sheet = np.vstack(sheet_rows)
+    chosen, frames, width, farthest = _sampled(episode, columns * rows)
+    images = [
+        np.vstack(
+            [
+                _thumb(frames.rgb_THWC[k], width, str(number)),
+                _thumb(depth_colours(frames.depth_THW[k], farthest), width),
+            ]
+        )
+        for k, number in enumerate(chosen)
+    ]
+    sheet = _sheet(images, columns)
     plan = view_from_above(episode, sheet.shape[1] - 2 * MARGIN)
     framed = cv2.copyMakeBorder(
         plan, MARGIN, MARGIN, MARGIN, MARGIN, cv2.BORDER_CONSTANT, value=(BACKGROUND,) * 3
     )
     return np.vstack([sheet, framed])
+
+
+def _sampled(episode: Episode, most: int) -> tuple[np.ndarray, Frames, int, float]:
+    """Return frames to draw: their numbers, images, width of a thumbnail, and largest depth."""
+    count = min(most, episode.length)
+    chosen = np.round(np.linspace(0, episode.length - 1, count)).astype(int)
+    frames = episode.frames(chosen)
+    width = max(1, round(THUMB * episode.width / episode.height))
+    return chosen, frames, width, max(float(frames.depth_THW.max()), 1e-3)
+
+
+def _sheet(images: list[np.ndarray], columns: int) -> np.ndarray:
+    """Return images of one size in rows."""
+    images = images + [np.full_like(images[0], BACKGROUND)] * (-len(images) % columns)
+    return np.vstack([np.hstack(images[k : k + columns]) for k in range(0, len(images), columns)])
 
 
 def draw_voxels(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray:
@@ -107,26 +123,20 @@ def draw_voxels(episode: Episode, columns: int = 8, rows: int = 2) -> np.ndarray
     Raises:
         UserError: the episode has no voxels.
     """
-    count = min(columns * rows, episode.length)
-    chosen = np.round(np.linspace(0, episode.length - 1, count)).astype(int)
-    frames, voxels = episode.frames(chosen), episode.voxels(chosen)
-    width = max(1, round(THUMB * episode.width / episode.height))
-    farthest = max(float(frames.depth_THW.max()), 1e-3)
-    sheet = []
+    chosen, frames, width, farthest = _sampled(episode, columns * rows)
+    voxels, images = episode.voxels(chosen), []
     for k, number in enumerate(chosen):
         seen = grid_from_camera(voxels, k, frames.camera, episode.height, episode.width)
         plan = grid_from_above(voxels, k, frames.camera)
-        images = [
+        column = [
             _thumb(frames.rgb_THWC[k], width, str(number)),
             _thumb(seen.rgb_HWC, width),
             _thumb(depth_colours(frames.depth_THW[k], farthest), width),
             _thumb(depth_colours(seen.depth_HW, farthest), width),
             _thumb(plan, width),
         ]
-        sheet.append(np.vstack(images))
-    blank = [np.full_like(sheet[0], BACKGROUND)] * (-count % columns)
-    sheet += blank
-    return np.vstack([np.hstack(sheet[k : k + columns]) for k in range(0, len(sheet), columns)])
+        images.append(np.vstack(column))
+    return _sheet(images, columns)
 
 
 def depth_colours(depth_HW: np.ndarray, farthest_m: float) -> np.ndarray:
@@ -164,20 +174,19 @@ def view_from_above(episode: Episode, width: int) -> np.ndarray:
     at, colours = at[inside][order], colours[inside][order]
     image[at[:, 1], at[:, 0]] = colours
     image = cv2.dilate(image, np.ones((3, 3), np.uint8))
-    spots = pixels(path)
+    spots = pixels(path).tolist()
     turn = episode.info.get("return_frame")
     for k in range(len(spots) - 1):
         done = k / max(1, len(spots) - 2)
         colour = (int(255 * done), int(255 * (1 - done)), 40)
-        wide = turn is not None and k < turn
-        _line(image, spots[k], spots[k + 1], colour, 7 if wide else 2)
-    cv2.circle(image, _pixel(spots[0]), 9, (40, 255, 40), -1, cv2.LINE_AA)
-    cv2.circle(image, _pixel(spots[-1]), 5, (255, 40, 40), -1, cv2.LINE_AA)
+        wide = 7 if turn is not None and k < turn else 2
+        cv2.line(image, spots[k], spots[k + 1], colour, wide, cv2.LINE_AA)
+    cv2.circle(image, spots[0], 9, (40, 255, 40), -1, cv2.LINE_AA)
+    cv2.circle(image, spots[-1], 5, (255, 40, 40), -1, cv2.LINE_AA)
     if turn is not None:
-        cv2.circle(image, _pixel(spots[turn]), 12, (255, 255, 255), 2, cv2.LINE_AA)
-    _line(
-        image, np.array([10, shape[0] - 10]), np.array([10 + scale, shape[0] - 10]), (255,) * 3, 2
-    )
+        cv2.circle(image, spots[turn], 12, (255, 255, 255), 2, cv2.LINE_AA)
+    below = shape[0] - 10
+    cv2.line(image, (10, below), (int(10 + scale), below), (255,) * 3, 2, cv2.LINE_AA)
     _write(image, "1 m", (10, shape[0] - 16))
     plan = np.full((shape[0], width, 3), BACKGROUND, np.uint8)
     plan[:, left : left + shape[1]] = image
@@ -188,16 +197,12 @@ def _points(episode: Episode) -> tuple[np.ndarray, np.ndarray]:
     """Return points in the world (N, 3) below the ceiling, and their colours (N, 3)."""
     frames = episode.frames(np.unique(np.linspace(0, episode.length - 1, 60).astype(int)))
     step = max(1, episode.height // 64)
-    fx, fy, cx, cy = np.asarray(episode.intrinsics_4, np.float64)
-    v, u = np.mgrid[0 : episode.height : step, 0 : episode.width : step]
-    rays = np.stack([(u + 0.5 - cx) / fx, (v + 0.5 - cy) / fy, np.ones(u.shape)], -1)
     points, colours = [], []
-    for k, pose in enumerate(np.asarray(frames.camera.world_from_camera, np.float64)):
-        depth = frames.depth_THW[k][v, u]
-        world = (rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3]
-        kept = (depth > 0) & (world[..., 2] < pose[2, 3] + CEILING_M)
-        points.append(world[kept])
-        colours.append(frames.rgb_THWC[k][v, u][kept])
+    for k, pose in enumerate(np.asarray(frames.camera.world_from_camera)):
+        world, (v, u) = measured_points(frames.depth_THW[k], episode.intrinsics_4, pose, step)
+        low = world[:, 2] < float(pose[2, 3]) + CEILING_M
+        points.append(world[low])
+        colours.append(frames.rgb_THWC[k][v, u][low])
     return np.concatenate(points), np.concatenate(colours)
 
 
@@ -214,11 +219,60 @@ def _write(image: np.ndarray, text: str, where: tuple[int, int]) -> None:
         cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thick, cv2.LINE_AA)
 
 
-def _line(
-    image: np.ndarray, start: np.ndarray, end: np.ndarray, colour: tuple[int, ...], wide: int
-) -> None:
-    cv2.line(image, _pixel(start), _pixel(end), colour, wide, cv2.LINE_AA)
+@dataclasses.dataclass(frozen=True)
+class GridView:
+    """A grid as a camera sees it: shaded colours, z-depth in metres, class ids (0: no hit)."""
+
+    rgb_HWC: np.ndarray
+    depth_HW: np.ndarray
+    classes_HW: np.ndarray
 
 
-def _pixel(spot: np.ndarray) -> tuple[int, int]:
-    return int(spot[0]), int(spot[1])
+def grid_from_camera(
+    voxels: VoxelFrames, frame: int, camera: Camera, height: int, width: int
+) -> GridView:
+    """Return the grid of one frame as its camera, one of (T,), sees it."""
+    one = Camera(camera.intrinsics_4[frame : frame + 1], camera.world_from_camera[frame][None])
+    hits = _march(height, width)(
+        voxels.classes_TXYZ[frame], voxels.origin_T3[frame], np.float32(voxels.cell_m), one
+    )
+    ids, depth, side = (
+        np.asarray(x)[0, ..., 0] for x in (hits.ids_L, hits.distance_L, hits.side_L)
+    )
+    seen = ids > 0
+    colours = table_colours(voxels.names)[ids] * LIGHT[side][..., None]
+    rgb = np.where(seen[..., None], colours, BACKGROUND).astype(np.uint8)
+    return GridView(rgb, np.where(seen, depth, 0).astype(np.float32), ids)
+
+
+@functools.lru_cache(maxsize=4)
+def _march(height: int, width: int):
+    """Return the compiled march for an image size."""
+    march = functools.partial(through_pixels, height=height, width=width, layers=1)
+    return jax.jit(march)
+
+
+def grid_from_above(voxels: VoxelFrames, frame: int, camera: Camera) -> np.ndarray:
+    """Return the grid of one frame from above (RGB, x to the right, y up), with the field of view.
+
+    Of each column the highest cell below ``ABOVE_M`` over the camera is drawn; higher cells are
+    lighter.
+    """
+    grid, origin, cell = voxels.classes_TXYZ[frame], voxels.origin_T3[frame], voxels.cell_m
+    pose = np.asarray(camera.world_from_camera[frame], np.float64)
+    top = int(np.clip((pose[2, 3] + ABOVE_M - origin[2]) / cell, 1, grid.shape[2]))
+    full = grid[:, :, :top] > 0
+    height = np.where(full.any(2), top - 1 - full[:, :, ::-1].argmax(2), 0)
+    ids = np.take_along_axis(grid[:, :, :top], height[..., None], 2)[..., 0]
+    light = 0.55 + 0.45 * height / max(1, top - 1)
+    colours = table_colours(voxels.names)[ids] * light[..., None]
+    colours = np.where(full.any(2)[..., None], colours, BACKGROUND)
+    image = np.repeat(np.repeat(colours.swapaxes(0, 1), PIXELS, 0), PIXELS, 1)
+    image = np.ascontiguousarray(image[::-1], np.uint8)
+    at = (pose[:2, 3] - origin[:2]) / cell * PIXELS
+    fx, width = float(camera.intrinsics_4[frame][0]), 2 * float(camera.intrinsics_4[frame][2])
+    for sign in (-1, 0, 1):
+        way = (pose[:2, :3] @ [sign * width / 2 / fx, 0.0, 1.0]) * 2.0 / cell * PIXELS
+        ends = [(round(x), round(len(image) - 1 - y)) for x, y in (at, at + way)]
+        cv2.line(image, ends[0], ends[1], (255, 60, 60), 2, cv2.LINE_AA)
+    return image

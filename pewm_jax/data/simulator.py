@@ -31,15 +31,9 @@ KEPT_HOUSES, KEPT_MESHES = 16, 2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Simulator:
-    """A scene, the cells where an agent can stand, and the agent's camera.
+    """A scene, the cells where an agent's centre can be, and the agent's camera.
 
-    Attributes:
-        scene: the scene.
-        grid: the cells in which the agent's centre may be.
-        intrinsics_4: (4,) fx, fy, cx, cy in pixels, centres at +0.5.
-        height: image height in pixels.
-        width: image width in pixels.
-        camera_height: height of the camera above the floor, metres.
+    Sizes of images are in pixels, the height of the camera above the floor in metres.
     """
 
     scene: Scene
@@ -55,14 +49,10 @@ class Simulator:
         return pose_from_yaw(np.array([x, y, self.grid.floor_z + self.camera_height]), yaw)
 
     def frames(self, planar_T3: np.ndarray) -> Frames:
-        """Render the frames seen from planar poses.
+        """Render the T NumPy frames seen from planar poses (T, 3): x, y, yaw, metres and radians.
 
-        Args:
-            planar_T3: (T, 3) x, y, yaw in the world, metres and radians.
-
-        Returns:
-            T NumPy frames: rgb uint8, depth in metres; 0 where nothing is hit, and beyond the
-            largest depth that episodes can store (65.534 m).
+        Depth is 0 where nothing is hit, and beyond the largest depth that episodes can store
+        (65.534 m).
         """
         poses = np.stack([self.world_from_camera(pose) for pose in np.asarray(planar_T3)])
         intrinsics = np.tile(self.intrinsics_4, (len(poses), 1))
@@ -82,28 +72,21 @@ def open_simulator(
     hfov: float = 90.0,
     camera_height: float = 1.25,
 ) -> Simulator:
-    """Open a mesh, or the generated house of a seed.
+    """Open a mesh file in metres, or the generated house of a seed.
 
-    Args:
-        house_seed: seed of the house, used without a mesh.
-        scene: a mesh (GLB, OBJ, PLY, …) in metres.
-        up: which axis of the mesh points up; ``auto``: y for GLB and glTF, z for the others.
-        height: image height in pixels.
-        width: image width in pixels.
-        hfov: horizontal field of view, degrees.
-        camera_height: height of the camera above the floor, metres.
+    ``up`` is the axis of the mesh that points up; ``auto``: y for GLB and glTF, z for the others.
+    Sizes of images are in pixels, the field of view in degrees, the camera's height above the floor
+    in metres.
 
     Raises:
         UserError: there is no renderer, or a mesh does not load or has no free floor.
     """
     require_embree()
-    world, grid = (
-        _kept_house(house_seed, camera_height)
-        if scene is None
-        else _cached_mesh(
-            scene, scene.stat().st_mtime_ns if scene.is_file() else 0, up, camera_height
-        )
-    )
+    if scene is None:
+        world, grid = _kept_house(house_seed, camera_height)
+    else:
+        changed = scene.stat().st_mtime_ns if scene.is_file() else 0
+        world, grid = _cached_mesh(scene, changed, up, camera_height)
     intrinsics = intrinsics_from_fov(height, width, hfov)
     return Simulator(world, grid, intrinsics, height, width, camera_height)
 
@@ -120,12 +103,11 @@ def move(
     Args:
         grid: the cells where the agent can stand.
         planar_3: x, y, yaw; x and y lie in a free cell.
-        action_3: dx, dy, dyaw: metres forward, metres left, radians counter-clockwise.
+        action_3: metres forward, metres left, radians counter-clockwise.
         sliding: whether the agent slides along obstacles.
 
     Returns:
-        ``(planar_3, collided)``: the next pose, yaw in (−π, π], in a free cell; and whether the
-        straight line was blocked.
+        The next pose, yaw in (−π, π], in a free cell; and whether the straight line was blocked.
     """
     planar = np.asarray(planar_3, np.float64)
     after = advance(planar, np.asarray(action_3, np.float64))

@@ -37,7 +37,7 @@ class Trajectory:
     """Poses of the agent and its actions.
 
     Attributes:
-        planar_T3: (T, 3) float64 x, y, yaw in the world, metres and radians.
+        planar_T3: float64 x, y, yaw in the world, metres and radians.
         actions: (T − 1, 3) float64 dx, dy, dyaw.
         action_ids: (T − 1,) int32, or None for continuous actions.
         return_frame: the frame at which a revisit trajectory turns back, or None.
@@ -154,8 +154,7 @@ def make_trajectory(
         frames: number of frames T; T − 1 actions are made.
         rng: source of all randomness.
         policy: ``follow`` walks shortest paths between far goals, ``walk`` goes straight up to
-            obstacles, ``revisit`` turns around, goes out to a far goal and comes back through the
-            same positions.
+            obstacles, ``revisit`` turns, goes to a far goal and comes back over the same positions.
         turn_around: probability of a full turn at the start (``revisit`` always makes it).
         continuous: small (dx, dy, dyaw) instead of the three discrete actions.
 

@@ -40,13 +40,7 @@ class ValidateConfig:
 
 @dataclasses.dataclass(frozen=True)
 class ValidationResult:
-    """The result of a validation.
-
-    Attributes:
-        episodes: number of episodes checked.
-        frames: their total number of frames.
-        problems: all problems found.
-    """
+    """The number of episodes checked, their total number of frames, and all problems found."""
 
     episodes: int
     frames: int
@@ -56,34 +50,27 @@ class ValidationResult:
 def validate(config: ValidateConfig, log: Callable[[str], None] = print) -> ValidationResult:
     """Check everything under a path.
 
-    Args:
-        config: the path.
-        log: receives the lines to print.
-
     Raises:
         UserError: there is nothing to check at the path, or a split is unfinished or truncated.
     """
     path = config.path
-    if path.is_file():
-        files, problems = [path], []
-    else:
-        files, problems = _files(path)
-    total = sum(count_records(file) for file in files)
-    episodes = frames = 0
+    files, problems = ([path], []) if path.is_file() else _files(path)
+    counts = {file: count_records(file) for file in files}
+    frames = 0
     grids: dict[Path, VoxelGrid] = {}
-    with Meter(f"validating {path}", total, "episodes") as meter:
-        for file in files:
-            for index in range(count_records(file)):
+    with Meter(f"validating {path}", sum(counts.values()), "episodes") as meter:
+        for file, count in counts.items():
+            for index in range(count):
                 length, found = _check_record(file, index, grids)
-                episodes, frames, problems = episodes + 1, frames + length, problems + found
+                frames, problems = frames + length, problems + found
                 meter.advance(1)
     for problem in problems[:SHOWN]:
         log(str(problem))
     if len(problems) > SHOWN:
         log(f"… and {len(problems) - SHOWN} more.")
     if not problems:
-        log(f"{path}: {episodes} episodes, {frames} frames, no problems.")
-    return ValidationResult(episodes, frames, problems)
+        log(f"{path}: {meter.done} episodes, {frames} frames, no problems.")
+    return ValidationResult(meter.done, frames, problems)
 
 
 def _files(path: Path) -> tuple[list[Path], list[Problem]]:
@@ -125,13 +112,7 @@ def _check_hashes(folder: Path, manifest: Manifest) -> list[Problem]:
 def _check_record(
     file: Path, index: int, grids: dict[Path, VoxelGrid]
 ) -> tuple[int, list[Problem]]:
-    """Return the number of frames of a record and its problems.
-
-    Args:
-        file: the shard.
-        index: the record's number in it.
-        grids: the voxel grid of each folder's first record; filled in here.
-    """
+    """Return the frames of a record and its problems; ``grids`` gets each folder's first grid."""
     where = f"{file}, record {index}"
     try:
         episode = read_episode(read_record(file, index), where)

@@ -41,9 +41,9 @@ class FilledCells:
     """The cells that surfaces pass through, each once.
 
     Attributes:
-        cell_N3: (N, 3) int64 indices of the cells in the lattice, any sign.
-        class_N: (N,) class ids.
-        weight_N: (N,) weights of the classes: their area, in faces of a cell.
+        cell_N3: int64 indices of the cells in the lattice, any sign.
+        class_N: class ids.
+        weight_N: weights of the classes: their area, in faces of a cell.
     """
 
     cell_N3: np.ndarray
@@ -56,11 +56,11 @@ class Lattice:
     """The class ids of the cells in a box of the world.
 
     Attributes:
-        classes_XYZ: (X, Y, Z) class ids, 0 in empty cells.
-        weight_XYZ: (X, Y, Z) float32 weights of the classes.
-        first_3: (3,) index of the lowest cell along each axis.
+        classes_XYZ: class ids, 0 in empty cells.
+        weight_XYZ: float32 weights of the classes.
+        first_3: index of the lowest cell along each axis.
         cell_m: side of a cell, metres.
-        point_3: (3,) the lowest corner of cell (0, 0, 0), metres.
+        point_3: the lowest corner of cell (0, 0, 0), metres.
     """
 
     classes_XYZ: np.ndarray
@@ -73,10 +73,8 @@ class Lattice:
 def fill(config: VoxelsConfig, scene: Scene, point_3: np.ndarray) -> FilledCells:
     """Return the cells that the surfaces of a scene pass through.
 
-    Args:
-        config: the cell and the classes.
-        scene: the static scene, or its moving parts at one moment.
-        point_3: the lowest corner of the lattice's cell (0, 0, 0), metres.
+    The scene may be moving parts at one moment; ``point_3`` is the lowest corner of the lattice's
+    cell (0, 0, 0), metres.
     """
     kind_O = np.array([KINDS.index(kind_of(name)) for name in scene.objects])
     kind_F = kind_O[scene.object_F]
@@ -106,14 +104,11 @@ def lattice_of(config: VoxelsConfig, filled: FilledCells, point_3: np.ndarray) -
 def crop_grids(
     lattice: Lattice, side: int, centre_T3: np.ndarray, moving: list[FilledCells] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Crop the grids around positions from a lattice.
+    """Crop the grids around positions (T, 3), metres, from a lattice.
 
-    Args:
-        lattice: the static cells.
-        side: n, cells along each axis.
-        centre_T3: (T, 3) positions, metres. If n is odd, a position lies in the middle cell of its
-            grid; if n is even, within half a cell of the grid's middle.
-        moving: the moving cells of each frame; they replace static cells of lower weight.
+    If ``side``, the number of cells along each axis, is odd, a position lies in the middle cell of
+    its grid; if it is even, within half a cell of the grid's middle. The moving cells of each frame
+    replace static cells of lower weight.
 
     Returns:
         ``(classes_TXYZ, origin_T3)``: (T, n, n, n) class ids, and (T, 3) float64 lowest corners,
@@ -130,10 +125,7 @@ def crop_grids(
 
 
 def split_at_borders(corners_F33: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cut triangles at whole numbers along each axis.
-
-    Args:
-        corners_F33: (F, 3, 3) the corners of triangles, in cells.
+    """Cut triangles (F, 3, 3), in cells, at whole numbers along each axis.
 
     Returns:
         ``(piece_N33, face_N)``: triangles that each lie within one cell, and the index of the
@@ -200,11 +192,8 @@ def _heaviest(cell_N3: np.ndarray, class_N: np.ndarray, weight_N: np.ndarray) ->
 
 def merge_cells(parts: Sequence[FilledCells]) -> FilledCells:
     """Return the cells that any of the parts fill, each with its heaviest class."""
-    return _heaviest(
-        np.concatenate([part.cell_N3 for part in parts]),
-        np.concatenate([part.class_N for part in parts]),
-        np.concatenate([part.weight_N for part in parts]),
-    )
+    fields = ("cell_N3", "class_N", "weight_N")
+    return _heaviest(*(np.concatenate([getattr(p, name) for p in parts]) for name in fields))
 
 
 def _overlay(grid_XYZ: np.ndarray, low_3: np.ndarray, moving: FilledCells, still: Lattice) -> None:
@@ -243,15 +232,10 @@ def record_voxels(
     moving: MovingHouse | None = None,
     poses_TP44: np.ndarray | None = None,
 ) -> VoxelFrames:
-    """Return the grids around an agent at T frames.
+    """Return the grids around an agent, whose camera is at (T, 3) metres, at T frames.
 
-    Args:
-        config: cell, side and classes.
-        scene: the static scene.
-        floor_z: height of the floor, which becomes a border of cells, metres.
-        centre_T3: (T, 3) positions of the agent's camera, metres.
-        moving: the house with moving parts, if there are any.
-        poses_TP44: (T, P, 4, 4) poses of these parts, from ``MovingHouse.poses``.
+    The floor at ``floor_z`` becomes a border of cells. Moving parts have the poses of
+    ``MovingHouse.poses``.
     """
     lattice = _lattice(config, scene, floor_z)
     moved: list[FilledCells] | None = None

@@ -107,10 +107,7 @@ class VoxelsConfig:
 def class_ids(config: VoxelsConfig, kind_N: np.ndarray, rgb_N3: np.ndarray) -> np.ndarray:
     """Return (N,) class ids of surfaces.
 
-    Args:
-        config: the classes.
-        kind_N: (N,) indices into ``KINDS``.
-        rgb_N3: (N, 3) their colours without light, in [0, 1].
+    The kinds are indices into ``KINDS``, the colours are without light, in [0, 1].
     """
     row = config.kind_names.index
     of_kind = [row(kind if config.kinds == "all" else GROUPS[kind]) for kind in KINDS]
@@ -167,7 +164,7 @@ class VoxelFrames:
 
     Attributes:
         classes_TXYZ: (T, n, n, n) uint8 or uint16 class ids, 0 where nothing is.
-        origin_T3: (T, 3) float32 world position of each grid's lowest corner, metres.
+        origin_T3: float32 world position of each grid's lowest corner, metres.
         cell_m: side of a cell, metres.
         names: the table of classes.
     """
@@ -230,11 +227,7 @@ def header_of(voxels: VoxelFrames) -> dict[str, Any]:
 
 
 def grid_in(stream: dict[str, Any], where: str) -> VoxelGrid:
-    """Return the grid that the header of a record describes.
-
-    Raises:
-        DamagedError: the header is incomplete or inconsistent.
-    """
+    """Return the grid that the header of a record describes; DamagedError if it is inconsistent."""
     try:
         cell, side, dtype = float(stream["cell_m"]), int(stream["side"]), str(stream["dtype"])
         names = tuple(map(str, stream["classes"]))
@@ -251,11 +244,7 @@ def grid_in(stream: dict[str, Any], where: str) -> VoxelGrid:
 
 
 def require_alike(first: VoxelGrid, other: VoxelGrid, where: str) -> None:
-    """Raise an error if grids differ from others of the same data.
-
-    Raises:
-        UserError: the cell, the side or the table of classes differs.
-    """
+    """Raise UserError if grids differ in cell, side or classes from others of the same data."""
     if (other.side, other.dtype) != (first.side, first.dtype) or not np.isclose(
         other.cell_m, first.cell_m
     ):
@@ -285,12 +274,7 @@ LOOKS, STEP = 8, 3
 
 
 def check_voxels(voxels: VoxelFrames, frames: int, where: str) -> None:
-    """Check grids before they are written.
-
-    Args:
-        voxels: the grids.
-        frames: the expected number of grids.
-        where: their name in messages.
+    """Check grids before they are written; ``frames`` is their expected number.
 
     Raises:
         UserError: the number of grids is wrong, a grid is not a cube, a class is not in the table,
@@ -347,30 +331,36 @@ def outside(origin_T3: np.ndarray, grid: VoxelGrid, place_T3: np.ndarray) -> lis
     return np.flatnonzero(((at < 0) | (at > 1)).any(-1)).tolist()
 
 
+def measured_points(
+    depth_HW: np.ndarray, intrinsics_4: np.ndarray, world_from_camera: np.ndarray, step: int = 1
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Return the world points (N, 3) of measured pixels, and their rows and columns.
+
+    In float64 on the host; of the rows and of the columns every ``step``-th is used.
+    """
+    v, u = np.mgrid[0 : depth_HW.shape[0] : step, 0 : depth_HW.shape[1] : step]
+    seen = depth_HW[v, u] > 0
+    u, v = u[seen], v[seen]
+    z = depth_HW[v, u].astype(np.float64)
+    fx, fy, cx, cy = np.asarray(intrinsics_4, np.float64)
+    pose = np.asarray(world_from_camera, np.float64)
+    points = np.stack([(u + 0.5 - cx) / fx * z, (v + 0.5 - cy) / fy * z, z], -1)
+    return points @ pose[:3, :3].T + pose[:3, 3], (v, u)
+
+
 def disagreement(
     voxels: VoxelFrames, depth_THW: np.ndarray, camera: Camera
 ) -> tuple[int, float] | None:
     """Return the frame that disagrees most with its grid, and the share of floating points.
 
-    A point that the camera sees in the grid floats if its cell and the cells around it are empty.
-
-    Args:
-        voxels: the grids of T frames.
-        depth_THW: their depths, metres.
-        camera: (T,) their cameras.
-
-    Returns:
-        None if at most ``MOST_FLOATING`` of the points of all frames float.
+    A point that the camera sees in the grid, by the depths (T, H, W) in metres, floats if its cell
+    and the cells around it are empty. None if at most ``MOST_FLOATING`` of the points of all frames
+    float.
     """
-    frames, height, width = depth_THW.shape
-    rows, columns = np.mgrid[0:height:STEP, 0:width:STEP]
-    lost, seen = np.zeros(frames), np.zeros(frames)
-    for t in range(frames):
-        depth = np.asarray(depth_THW[t, rows, columns], np.float64)
-        fx, fy, cx, cy = np.asarray(camera.intrinsics_4[t], np.float64)
-        ray = np.stack([(columns + 0.5 - cx) / fx, (rows + 0.5 - cy) / fy, np.ones_like(depth)], -1)
-        pose = np.asarray(camera.world_from_camera[t], np.float64)
-        points = (ray * depth[..., None])[depth > 0] @ pose[:3, :3].T + pose[:3, 3]
+    lost, seen = np.zeros(len(depth_THW)), np.zeros(len(depth_THW))
+    for t, depth_HW in enumerate(depth_THW):
+        pose = camera.world_from_camera[t]
+        points, _ = measured_points(depth_HW, camera.intrinsics_4[t], pose, STEP)
         grid = voxels.classes_TXYZ[t]
         near = np.asarray(ndimage.binary_dilation(grid > 0, np.ones((3, 3, 3))))
         cell = np.floor((points - voxels.origin_T3[t]) / voxels.cell_m).astype(int)

@@ -67,14 +67,7 @@ def step_pose(world_from_camera: Array, action_3: Array) -> Array:
 
 
 def integrate(world_from_camera: Array, actions_T3: Array) -> Array:
-    """Return the poses reached by carrying out actions from a pose.
-
-    Args:
-        world_from_camera: (4, 4) pose of frame 0.
-        actions_T3: (T, 3) actions; action k leads from frame k to frame k + 1.
-
-    Returns:
-        (T + 1, 4, 4) poses of frames 0 … T.
+    """Return the (T + 1, 4, 4) poses reached from a (4, 4) pose by (T, 3) actions.
 
     Raises:
         UserError: an argument has another type or shape, or is not finite.
@@ -92,14 +85,10 @@ def integrate(world_from_camera: Array, actions_T3: Array) -> Array:
 
 
 def compose(actions_S3: np.ndarray) -> np.ndarray:
-    """Compose consecutive planar actions into single ones.
+    """Compose consecutive planar actions (..., S, 3) into single ones (..., 3), float32.
 
-    Args:
-        actions_S3: (..., S, 3) planar actions, in sequence.
-
-    Returns:
-        (..., 3) float32: the final position in the initial frame, and the sum of the turns (not
-        wrapped: a full circle is 2π).
+    They are the final position in the initial frame and the sum of the turns (not wrapped: a full
+    circle is 2π).
     """
     moves = np.asarray(actions_S3, np.float64)
     dx, dy, turn = moves[..., 0], moves[..., 1], moves[..., 2]
@@ -120,13 +109,9 @@ def actions_between(world_from_camera_T: Array) -> Array:
 
 
 def there_and_back(actions_T3: Array) -> Array:
-    """Return planar actions followed by those that lead back through the same poses.
+    """Return planar actions (..., T, 3) and those that lead back: (..., 2 T, 3).
 
-    Args:
-        actions_T3: (..., T, 3) planar actions.
-
-    Returns:
-        (..., 2 T, 3): the pose after k actions equals the pose after 2 T − k.
+    The pose after k actions equals the pose after 2 T − k.
     """
     out = jnp.asarray(actions_T3)
     turn = -out[..., 2:]
@@ -169,12 +154,9 @@ def pitch(world_from_camera: Array) -> Array:
 
 
 def camera_steps_between(before: Camera, after: Camera, width: int) -> Array:
-    """Return the steps (..., 6) that lead from cameras to others of the same shape.
+    """Return the steps (..., 6) that lead from upright cameras to others of the same shape.
 
-    Args:
-        before: upright cameras.
-        after: upright cameras.
-        width: width of the images that the intrinsics belong to, pixels.
+    ``width`` is that of the images that the intrinsics belong to, pixels.
     """
     here, there = (jnp.asarray(x.world_from_camera) for x in (before, after))
     yaw = heading(here)
@@ -187,12 +169,9 @@ def camera_steps_between(before: Camera, after: Camera, width: int) -> Array:
 
 
 def follow_camera_steps(before: Camera, step_6: Array, width: int) -> Camera:
-    """Return the upright cameras after steps; the inverse of ``camera_steps_between``.
+    """Return the upright cameras after steps (..., 6); the inverse of ``camera_steps_between``.
 
-    Args:
-        before: cameras; their roll is dropped.
-        step_6: (..., 6) steps.
-        width: width of the images that the intrinsics belong to, pixels.
+    The roll of the cameras before is dropped.
     """
     here, intrinsics = jnp.asarray(before.world_from_camera), jnp.asarray(before.intrinsics_4)
     moved = einsum("...ij,...j->...i", rotation_z(heading(here)), step_6[..., :3])

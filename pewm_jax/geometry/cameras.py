@@ -1,4 +1,4 @@
-"""Pinhole cameras: intrinsics, rigid transforms, projection and unprojection.
+"""Pinhole cameras: intrinsics, rigid transforms, projection, unprojection, Plücker embedding.
 
 Works on NumPy and JAX arrays alike with any leading shape. See ``pewm_jax.types`` for the axes.
 
@@ -33,11 +33,6 @@ def einsum(equation: str, *operands: Array) -> Array:
 def intrinsics_from_fov(height: int, width: int, horizontal_fov_deg: float) -> np.ndarray:
     """Return (4,) fx, fy, cx, cy of square pixels with the principal point in the middle.
 
-    Args:
-        height: of the images, pixels.
-        width: of the images, pixels.
-        horizontal_fov_deg: the horizontal field of view, degrees, between 0 and 180.
-
     Raises:
         UserError: an argument is not a number, or is out of its range.
     """
@@ -59,12 +54,10 @@ def resize_intrinsics(intrinsics_4: Array, scale_x: float, scale_y: float) -> Ar
 
 
 def pose_from_yaw(position_3: np.ndarray, yaw: float, pitch: float = 0.0) -> np.ndarray:
-    """Return the (4, 4) ``world_from_camera`` of an upright camera.
+    """Return the (4, 4) ``world_from_camera`` of an upright camera at a position, metres.
 
-    Args:
-        position_3: camera centre in the world, metres.
-        yaw: heading, radians, counter-clockwise from above; 0 looks along world +x.
-        pitch: radians, positive looks up.
+    The yaw is counter-clockwise from above, 0 looks along world +x; positive pitch looks up;
+    radians.
 
     Raises:
         UserError: an argument is not a number, or the position does not have shape (3,).
@@ -118,14 +111,9 @@ def ray_directions(intrinsics_4: Array, height: int, width: int) -> Array:
 
 
 def unproject(depth_HW: Array, camera: Camera) -> Array:
-    """Lift depth images to world points.
+    """Lift depth images (..., H, W) of cameras (...) to world points (..., H, W, 3), metres.
 
-    Args:
-        depth_HW: (..., H, W) z-depth in metres.
-        camera: cameras of the same leading shape.
-
-    Returns:
-        (..., H, W, 3) world points of the pixel centres; meaningless where depth is 0.
+    The points belong to the pixels' centres; they are meaningless where depth is 0.
     """
     height, width = depth_HW.shape[-2:]
     points = ray_directions(camera.intrinsics_4, height, width) * depth_HW[..., None]
@@ -134,11 +122,7 @@ def unproject(depth_HW: Array, camera: Camera) -> Array:
 
 
 def project(points_world_P3: Array, camera: Camera) -> tuple[Array, Array]:
-    """Project world points into cameras.
-
-    Args:
-        points_world_P3: (..., P, 3), leading shape broadcasts with the cameras'.
-        camera: cameras of leading shape (...).
+    """Project world points (..., P, 3) into cameras (...); the leading shapes broadcast.
 
     Returns:
         ``(uv_P2, z_P)``: pixel coordinates (centres at +0.5) and z-depth in metres. Where z is
@@ -151,8 +135,62 @@ def project(points_world_P3: Array, camera: Camera) -> tuple[Array, Array]:
     return jnp.stack([points[..., 0] / safe * fx + cx, points[..., 1] / safe * fy + cy], -1), z
 
 
+def plucker(camera: Camera, height: int, width: int) -> Array:
+    """Return (..., H, W, 6) Plücker coordinates (o × d, d) of every pixel's ray.
+
+    They live in the frame of the cameras' poses. The paper's Eq. 1 adds the translation to the
+    direction; a direction is not moved by translation, and CameraCtrl's code, which the paper
+    follows, does not add it: d = R K⁻¹ (u + ½, v + ½, 1), normalised.
+    """
+    return _plucker_of(_unit_directions(camera, height, width), camera)
+
+
+def _unit_directions(camera: Camera, height: int, width: int) -> Array:
+    """Return (..., H, W, 3) directions of length 1 in the cameras' own frames."""
+    direction = ray_directions(camera.intrinsics_4, height, width)
+    return direction / jnp.linalg.norm(direction, axis=-1, keepdims=True)
+
+
+def _plucker_of(direction: Array, camera: Camera) -> Array:
+    """Return (o × R d, R d) of directions d in the cameras' own frames; linear in them."""
+    rotation = camera.world_from_camera[..., None, :3, :3]
+    direction = matmul(direction, jnp.swapaxes(rotation, -1, -2))
+    origin = jnp.broadcast_to(camera.world_from_camera[..., None, None, :3, 3], direction.shape)
+    return jnp.concatenate([jnp.cross(origin, direction), direction], -1)
+
+
+def fold_frames(frames_TX: Array, temporal: int) -> Array:
+    """Group frames by the latent frame that covers them.
+
+    Frame 0 is repeated ``temporal`` times (the latent of the first frame covers it alone), then
+    every ``temporal`` frames belong to one latent: (..., T, X) → (..., t, temporal, X) on the
+    first axis of ``frames_TX`` with T = temporal·k + 1, t = k + 1.
+    """
+    repeated = jnp.concatenate([jnp.repeat(frames_TX[:1], temporal - 1, 0), frames_TX], 0)
+    return repeated.reshape(-1, temporal, *frames_TX.shape[1:])
+
+
+def camera_latents(camera: Camera, height: int, width: int, spatial: int, temporal: int) -> Array:
+    """Embed the (T,) cameras of one clip at the latent rate (paper, appendix Table 4).
+
+    The embedding is relative to the first camera; ``spatial`` pixels per latent cell are averaged,
+    and ``temporal`` frames per latent frame are folded into channels.
+
+    Returns:
+        (t, h, w, 6·temporal) camera channels; 24 for CogVideoX's factor 4.
+    """
+    camera = relative_to_first(camera)
+    direction = _unit_directions(camera, height, width)
+    frames, h, w = direction.shape[0], height // spatial, width // spatial
+    # The mean of rays is the ray of the mean: both parts are linear in the direction.
+    direction = direction.reshape(frames, h, spatial, w, spatial, 3).mean((2, 4))
+    pooled = _plucker_of(direction, camera)
+    folded = jnp.moveaxis(fold_frames(pooled, temporal), 1, -2)
+    return folded.reshape(*folded.shape[:-2], temporal * 6)
+
+
 def require_array(who: str, name: str, value: Any, *shape: Any) -> None:
-    """Raise an error for an argument that is not an array of finite numbers of a given shape.
+    """Raise UserError for an argument that is not an array of finite numbers of a given shape.
 
     Under jit, vmap and grad only types and shapes are checked, not values.
 
@@ -162,9 +200,6 @@ def require_array(who: str, name: str, value: Any, *shape: Any) -> None:
         value: the argument.
         shape: the sizes of its last axes, None for any size; if the first is Ellipsis, more axes
             may come before them.
-
-    Raises:
-        UserError: it has another type or shape, or contains NaN or infinity.
     """
     free, sizes = shape[:1] == (...,), tuple(n for n in shape if n is not ...)
     if isinstance(value, Tracer):

@@ -18,10 +18,7 @@ from pewm_jax.types import Array, Camera
 
 
 def nearest_known(known_THW: Array) -> tuple[Array, Array]:
-    """Return the nearest known pixel of each pixel.
-
-    Args:
-        known_THW: (T, H, W) bool.
+    """Return the nearest known pixel of each pixel of (T, H, W) images.
 
     Returns:
         ``(index, found)``, both (T, H·W): the linear index of the nearest known pixel in the same
@@ -60,13 +57,10 @@ def nearest_known(known_THW: Array) -> tuple[Array, Array]:
 
 
 def fill_depth(depth_THW: Array, otherwise: float) -> Array:
-    """Return depths whose holes have the depth of the nearest measured pixel.
+    """Return depths (T, H, W) whose holes (0) have the depth of the nearest measured pixel.
 
-    Images without holes are returned unchanged, at no cost.
-
-    Args:
-        depth_THW: (T, H, W) metres, 0 where not measured.
-        otherwise: depth for images without any measurement, metres.
+    Images without any measurement get the depth ``otherwise``, metres. Images without holes are
+    returned unchanged, at no cost.
     """
     depth = jnp.asarray(depth_THW)
 
@@ -79,17 +73,11 @@ def fill_depth(depth_THW: Array, otherwise: float) -> Array:
 
 
 def normals(depth_THW: Array, camera: Camera) -> Array:
-    """Return the unit normals of the surfaces seen at pixels, turned towards the camera.
+    """Return the unit normals (T, H, W, 3) of the surfaces at pixels, turned towards the camera.
 
     Along each image axis the difference is taken to the neighbour with the closer depth, so that
-    depth edges do not bend the normal.
-
-    Args:
-        depth_THW: (T, H, W) metres along z, 0 where not measured.
-        camera: (T,) cameras.
-
-    Returns:
-        (T, H, W, 3) in the world; 0 where the depth of the neighbours is unknown.
+    depth edges do not bend the normal. They are in the world, and 0 where the depth of the
+    neighbours is unknown.
     """
     depth = jnp.asarray(depth_THW)
     points = unproject(depth, camera)

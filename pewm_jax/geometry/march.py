@@ -1,8 +1,11 @@
-"""Cast rays through a grid of class ids: the occupied cells along each ray, in order.
+"""Cast rays through a grid of class ids: the occupied cells in order, and their light.
 
 A ray steps from cell to cell (Amanatides and Woo 1987, "A fast voxel traversal algorithm"). The
 next border is computed from the cell's index instead of by accumulation, so rounding errors do not
 grow along the ray. PERSIST's renderer (arXiv 2603.03482) uses such layers of faces for each pixel.
+
+The light of block worlds depends on the side of a block, on distance, and on nearby corners. Images
+of cells are rendered with it; PERSIST's world inverts it to read the colours of blocks.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.geometry.cameras import einsum
@@ -53,57 +57,42 @@ def march(
     directions_R3: Array,
     layers: int,
 ) -> RayHits:
-    """Return the occupied cells along rays, nearest first.
+    """Return the occupied cells along R rays, nearest first, as (R, L) hits.
 
     Args:
-        ids_XYZ: (X, Y, Z) integer class ids.
+        ids_XYZ: integer class ids.
         low_3: the corner of the grid with the smallest coordinates, metres.
         cell_m: side of a cell, metres.
-        origins_R3: (R, 3) origins of the rays, inside or outside the grid, metres.
-        directions_R3: (R, 3) directions of the rays, of any length above 0.
+        origins_R3: origins of the rays, inside or outside the grid, metres.
+        directions_R3: directions of the rays, of any length above 0.
         layers: L; cells after the first L are dropped.
 
-    Returns:
-        (R, L).
+    Raises:
+        UserError: the grid is too large for packing a cell into 32 bits.
     """
-    _require_bits(ids_XYZ.shape)
-    rays = len(origins_R3)
+    shape, rays = ids_XYZ.shape, len(origins_R3)
+    if SHIFT + sum((count + 1).bit_length() for count in shape) > 32:
+        raise UserError(f"the grid has {shape} cells; rays can cross at most 1022 along each axis.")
     start, way = (origins_R3 - low_3).T / cell_m, directions_R3.T / cell_m  # (3, R) each
     flat = jnp.asarray(ids_XYZ).reshape(-1)
     if rays <= CHUNK:
-        return _chunk(flat, ids_XYZ.shape, start, way, layers)
-    more = -rays % CHUNK
+        return _chunk(flat, shape, start, way, layers)
     parts = [
-        jnp.pad(x, ((0, 0), (0, more)), "edge").reshape(3, -1, CHUNK).swapaxes(0, 1)
+        jnp.pad(x, ((0, 0), (0, -rays % CHUNK)), "edge").reshape(3, -1, CHUNK).swapaxes(0, 1)
         for x in (start, way)
     ]
-    made = jax.lax.map(
-        lambda part: _chunk(flat, ids_XYZ.shape, part[0], part[1], layers), tuple(parts)
-    )
+    made = jax.lax.map(lambda part: _chunk(flat, shape, part[0], part[1], layers), tuple(parts))
     return jax.tree.map(lambda x: x.reshape(-1, layers)[:rays], made)
-
-
-def _require_bits(shape: tuple[int, ...]) -> None:
-    """Raise an error for grids whose cells cannot be packed into 32 bits."""
-    if SHIFT + sum((count + 1).bit_length() for count in shape) > 32:
-        raise UserError(f"the grid has {shape} cells; rays can cross at most 1022 along each axis.")
 
 
 def _chunk(
     flat: Array, shape: tuple[int, int, int], start: Array, way: Array, layers: int
 ) -> RayHits:
-    """Return ``march`` of a chunk of rays.
+    """Return ``march`` of a chunk of rays, whose origins and directions (3, R) are in cells.
 
     The inner loop only steps to the next cell and stores its index. The class ids of ``ROUND``
     cells are then looked up at once, which gives a word per ray with one bit per occupied cell.
     Finally each layer takes the lowest set bit of every ray. There are no scattered writes.
-
-    Args:
-        flat: (X·Y·Z,) class ids.
-        shape: X, Y, Z.
-        start: (3, R) origins of the rays, in cells.
-        way: (3, R) directions of the rays.
-        layers: L.
     """
     rays, words = start.shape[1], -(-(sum(shape) + 1) // ROUND)
     code = _PackedCells(shape)
@@ -193,11 +182,6 @@ class _PackedCells:
     """
 
     def __init__(self, shape: tuple[int, int, int]):
-        """Compute the bits of each field.
-
-        Args:
-            shape: cells of the grid along each axis.
-        """
         self.shape = shape
         self.bits = [(count + 1).bit_length() for count in shape]
         self.shifts = [SHIFT + sum(self.bits[:axis]) for axis in range(3)]
@@ -244,13 +228,7 @@ class _PackedCells:
 
 
 def _enter(start: Array, way: Array, shape_31: Array) -> tuple[Array, Array, Array]:
-    """Return the first cells (3, R) of rays, the sides by which they enter, and whether they do.
-
-    Args:
-        start: (3, R) origins of the rays, in cells.
-        way: (3, R) directions of the rays.
-        shape_31: cells of the grid.
-    """
+    """Return the first cells (3, R) of rays, the sides by which they enter, and whether they do."""
     still, forward, size = way == 0, way > 0, shape_31.astype(start.dtype)
     inverse = 1 / jnp.where(still, 1, way)
     never = still & ~((start >= 0) & (start < size))
@@ -275,19 +253,10 @@ def through_pixels(
     width: int,
     layers: int,
 ) -> RayHits:
-    """Return the cells that the rays through the pixels of cameras hit; distances are z-depths.
+    """Return the cells that the rays through the pixels of cameras hit, (T, H, W, L).
 
-    Args:
-        ids_XYZ: (X, Y, Z) integer class ids.
-        low_3: as for ``march``.
-        cell_m: as for ``march``.
-        camera: (T,) cameras, whose intrinsics belong to images of ``height`` × ``width``.
-        height: image height in pixels.
-        width: image width in pixels.
-        layers: L.
-
-    Returns:
-        (T, H, W, L).
+    Distances are z-depths. Arguments as for ``march``; the intrinsics of the (T,) cameras belong to
+    images of ``height`` × ``width`` pixels.
     """
     rows, columns = jnp.arange(height) + 0.5, jnp.arange(width) + 0.5
     fx, fy, cx, cy = jnp.moveaxis(camera.intrinsics_4, -1, 0)[..., None, None]
@@ -299,3 +268,71 @@ def through_pixels(
     origins = jnp.broadcast_to(pose[:, None, None, :3, 3], directions.shape)
     flat = march(ids_XYZ, low_3, cell_m, origins.reshape(-1, 3), directions.reshape(-1, 3), layers)
     return jax.tree.map(lambda x: x.reshape(*directions.shape[:-1], layers), flat)
+
+
+BRIGHTNESS = (0.88, 0.74, 1.0, 0.5)
+"""Light on sides perpendicular to x, y and z, and on the cell in which a ray starts."""
+BELOW = 0.62
+"""Light on a side seen from below, such as a ceiling."""
+HALF_M = 7.0
+"""Distance at which light falls to one half, metres."""
+CORNER, CORNER_M = 0.35, 0.2
+"""Darkening in a corner, and the distance from the corner at which it ends, metres."""
+
+
+def light(
+    occupied_XYZ: Array,
+    low_3: Array,
+    cell_m: float | Array,
+    eye_3: Array,
+    way_HW3: Array,
+    far_HW: Array,
+    side_HW: Array,
+) -> Array:
+    """Return the (H, W) factors that multiply the colours of the cells that rays hit.
+
+    Args:
+        occupied_XYZ: bool, which cells are occupied.
+        low_3: lowest corner of the grid, metres.
+        cell_m: side of a cell, metres.
+        eye_3: origin of the rays, metres.
+        way_HW3: (H, W, 3) directions of the rays.
+        far_HW: distance from the origin to the hit cell, in lengths of the direction.
+        side_HW: axis (0, 1, 2) across which the ray enters the cell; −1 if it starts inside.
+    """
+    facing = jnp.asarray(BRIGHTNESS, jnp.float32)[side_HW]
+    facing = jnp.where((side_HW == 2) & (way_HW3[..., 2] > 0), BELOW, facing)
+    metres = far_HW * jnp.linalg.norm(way_HW3, axis=-1)
+    at = (eye_3 - low_3 + far_HW[..., None] * way_HW3) / cell_m
+    dark = _corner_darkness(occupied_XYZ, cell_m, at, way_HW3, side_HW)
+    return facing / (1 + jnp.square(metres / HALF_M)) * (1 - CORNER * dark)
+
+
+def side_of(at_HW3: Array) -> Array:
+    """Return the (H, W) axis of the cell border nearest to points on the sides of cells.
+
+    Args:
+        at_HW3: points, in cells from the grid's lowest corner.
+    """
+    return jnp.abs(at_HW3 - jnp.round(at_HW3)).argmin(-1)
+
+
+def _corner_darkness(
+    occupied_XYZ: Array, cell_m: float | Array, at_HW3: Array, way_HW3: Array, side_HW: Array
+) -> Array:
+    """Return (H, W) how close points are to a corner: 1 in it, 0 from ``CORNER_M`` on."""
+    met = side_HW >= 0
+    across = np.arange(3) == jnp.where(met, side_HW, 0)[..., None]
+    # The open cell in front of the side, from which the ray comes.
+    before = jnp.where(across, jnp.round(at_HW3) - (way_HW3 > 0), jnp.floor(at_HW3))
+    before, inside = before.astype(jnp.int32), at_HW3 - jnp.floor(at_HW3)
+    shape, dark = np.array(occupied_XYZ.shape), jnp.zeros(side_HW.shape)
+    for axis in range(3):
+        for sign in (-1, 1):
+            beside = before + sign * (np.arange(3) == axis)
+            within = ((beside >= 0) & (beside < shape)).all(-1)
+            x, y, z = jnp.moveaxis(jnp.clip(beside, 0, shape - 1), -1, 0)
+            wall = met & within & occupied_XYZ[x, y, z] & ~across[..., axis]
+            gap = inside[..., axis] if sign < 0 else 1 - inside[..., axis]
+            dark = jnp.maximum(dark, jnp.where(wall, 1 - gap * cell_m / CORNER_M, 0))
+    return dark

@@ -31,13 +31,8 @@ NEAREST_M = 0.05
 class ProjectedPoints:
     """Points projected into one camera, one array per coordinate (fastest on all processors).
 
-    Attributes:
-        u_V: (V,) horizontal position, pixels.
-        v_V: (V,) vertical position, pixels.
-        z_V: (V,) depth, metres.
-        half_width_V: (V,) half their width, pixels.
-        half_height_V: (V,) half their height, pixels.
-        valid_V: (V,) bool; False for empty slots and points behind the camera.
+    Positions and half sizes are in pixels, depths in metres; ``valid_V`` is False for empty slots
+    and points behind the camera.
     """
 
     u_V: Array
@@ -51,14 +46,10 @@ class ProjectedPoints:
 def project_points(
     points_V3: Array, wide_V: Array, tall_V: Array, valid_V: Array, camera: Camera
 ) -> ProjectedPoints:
-    """Project points that have a size into one camera; see ``cameras.project``.
+    """Project points (V, 3) that have a size into one camera; see ``cameras.project``.
 
-    Args:
-        points_V3: (V, 3) in the world, metres.
-        wide_V: (V,) or () their widths parallel to the image, metres.
-        tall_V: (V,) or () their heights parallel to the image, metres.
-        valid_V: (V,) bool; others are empty slots.
-        camera: one camera.
+    Their widths and heights parallel to the image, (V,) or (), are in metres; points that are not
+    valid are empty slots.
     """
     world, (fx, fy, cx, cy) = invert_rigid(camera.world_from_camera), camera.intrinsics_4
     x, y, z = (sum((row[i] * points_V3[:, i] for i in range(3)), start=row[3]) for row in world[:3])
@@ -77,13 +68,8 @@ def project_points(
 def pixel_window(place: Array, half: Array, most: int) -> tuple[Array, Array]:
     """Return the pixels that points cover along one axis, as ``(begin, count)``, int32.
 
-    These are the pixels whose centres lie in [place − half, place + half): at least the pixel at
-    the position, and at most ``most`` pixels around it.
-
-    Args:
-        place: (…) positions of the points, pixels.
-        half: (…) half their sizes, pixels.
-        most: largest number of pixels.
+    These are the pixels whose centres lie in [place − half, place + half), both in pixels: at least
+    the pixel at the position, and at most ``most`` pixels around it.
     """
     half = jnp.minimum(half, most / 2)
     here = jnp.floor(place)
@@ -97,17 +83,11 @@ def nearest_per_pixel(
 ) -> tuple[Array, Array]:
     """Return (H·W,) depth and index of the nearest point covering each pixel; inf and ≥ V if none.
 
-    Windows are not drawn pixel by pixel. Windows of one size that begin at the same pixel cover the
-    same pixels, so only the nearest of them counts: there is one z-buffer per size. A window is
-    also the union of the two windows, one pixel smaller, that begin at the same and at the next
-    pixel: the z-buffer of each size is spread into that of the next smaller size, down to single
-    pixels.
-
-    Args:
-        projected: the points.
-        height: image height in pixels.
-        width: image width in pixels.
-        most: largest number of pixels that a point covers along each axis.
+    Points cover at most ``most`` pixels along each axis. Their windows are not drawn pixel by
+    pixel. Windows of one size that begin at the same pixel cover the same pixels, so only the
+    nearest of them counts: there is one z-buffer per size. A window is also the union of the two
+    windows, one pixel smaller, that begin at the same and at the next pixel: the z-buffer of each
+    size is spread into that of the next smaller size, down to single pixels.
     """
     left, wide = pixel_window(projected.u_V, projected.half_width_V, most)
     above, tall = pixel_window(projected.v_V, projected.half_height_V, most)
@@ -128,11 +108,7 @@ def nearest_per_pixel(
 def nearest_per_bin(bin_V: Array, z_V: Array, valid_V: Array, bins: int) -> tuple[Array, Array]:
     """Return the smallest depth in each bin and the lowest index that has it; inf and V if none.
 
-    Args:
-        bin_V: (V,) int32, the bin of each point; ignored for invalid points.
-        z_V: (V,) depths.
-        valid_V: (V,) bool.
-        bins: number of bins.
+    Bins (int32) and depths of points that are not valid are ignored.
     """
     count = len(z_V)
     bin_ = jnp.where(valid_V, bin_V, bins)
@@ -210,19 +186,11 @@ def visibility_rank(
     camera: Camera,
     size: tuple[int, int],
 ) -> Array:
-    """Return the (T, V) rank of each point for each camera, low first; inf for points out of view.
+    """Return the (T, V) rank of points for each camera, low first; inf for points out of view.
 
     Ranks below ``CLASS`` are those of points named by pixels, those of most pixels first. Ranks
     from ``CLASS`` on are those of points on a seen surface, and from 2 ``CLASS`` on those of hidden
-    points, both by depth.
-
-    Args:
-        points_V3: (V, 3) in the world, metres.
-        wide_V: (V,) or () their widths, metres.
-        tall_V: (V,) or () their heights, metres.
-        valid_V: (V,) bool; others are out of view.
-        camera: (T,) cameras.
-        size: image height and width in pixels.
+    points, both by depth. Arguments as for ``visible_first``.
     """
     count, (rows, columns) = len(points_V3), raster(size)
     scale = np.array([columns / size[1], rows / size[0]] * 2, np.float32)

@@ -137,9 +137,8 @@ def plant(rng: np.random.Generator, palette: Palette) -> Piece:
         angle = 2.4 * k + rng.uniform(0, 0.8)
         x, y = spread * np.cos(angle), 0.28 + spread * np.sin(angle)
         radius = rng.uniform(0.12, 0.17)
-        piece.ball(
-            (x, y, low + 0.09 * k), (radius, radius, radius * 1.2), shade(green, 0.8 + 0.1 * k)
-        )
+        radii = (radius, radius, radius * 1.2)
+        piece.ball((x, y, low + 0.09 * k), radii, shade(green, 0.8 + 0.1 * k))
     return piece
 
 
@@ -223,21 +222,13 @@ def wall_shelf(rng: np.random.Generator, palette: Palette) -> Piece:
     """Boards on the wall with books and things."""
     width = rng.uniform(0.7, 1.1)
     piece = Piece("wall_shelf", (width, 0.26, 0.85))
+    inner = (-width / 2 + 0.04, width / 2 - 0.04)
     for z in (0.0, 0.42):
         piece.box((-width / 2, width / 2), (0, 0.25), (z, z + 0.04), palette.wood)
         if rng.uniform() < 0.5:
-            books(
-                piece,
-                rng,
-                (-width / 2 + 0.04, width / 2 - 0.04),
-                (0.03, 0.22),
-                z=z + 0.04,
-                tallest=0.3,
-            )
+            books(piece, rng, inner, (0.03, 0.22), z=z + 0.04, tallest=0.3)
         else:
-            small_objects(
-                piece, rng, (-width / 2 + 0.04, width / 2 - 0.04), (0.06, 0.2), z=z + 0.04, count=4
-            )
+            small_objects(piece, rng, inner, (0.06, 0.2), z=z + 0.04, count=4)
     return piece
 
 

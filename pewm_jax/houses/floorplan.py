@@ -30,8 +30,7 @@ class Opening:
         side: wall it is in: 0 south (y low), 1 east, 2 north, 3 west.
         low: start along the wall (x for south and north, y otherwise), world metres.
         high: end along the wall.
-        bottom: lower edge above the floor.
-        top: upper edge above the floor.
+        bottom: lower edge above the floor, metres; ``top`` is its upper edge.
         kind: ``door`` or ``window``.
     """
 
@@ -50,11 +49,6 @@ class Room:
     rect: Rect
     use: str
     openings: tuple[Opening, ...]
-
-    @property
-    def area(self) -> float:
-        """Floor area in square metres."""
-        return (self.rect[2] - self.rect[0]) * (self.rect[3] - self.rect[1])
 
     def span(self, side: int) -> tuple[float, float]:
         """Return where a wall starts and ends along its axis."""
@@ -75,21 +69,18 @@ def draw_plan(rng: np.random.Generator) -> FloorPlan:
     """Draw a floor plan of 3 to 8 rooms in which every room can be reached."""
     count = int(rng.integers(3, 9))
     cells = _split(rng, count)
-    shared = _shared_walls(cells)
-    doorways = _doorways(rng, cells, shared)
+    doorways = _doorways(rng, cells, _shared_walls(cells))
     openings: list[list[Opening]] = [[] for _ in cells]
     for a, b, side, low, high in doorways:
         openings[a].append(Opening(side, low, high, 0.0, DOOR_TOP_M, "door"))
         openings[b].append(Opening((side + 2) % 4, low, high, 0.0, DOOR_TOP_M, "door"))
-    rects = [_inset(cell, WALL_M / 2) for cell in cells]
+    half = WALL_M / 2
+    rects = [(x0 + half, y0 + half, x1 - half, y1 - half) for x0, y0, x1, y1 in cells]
     outer = (0.0, 0.0, max(c[2] for c in cells), max(c[3] for c in cells))
     for index, cell in enumerate(cells):
         openings[index] += _windows(rng, cell, outer)
     uses = _uses(rng, [(r[2] - r[0]) * (r[3] - r[1]) for r in rects])
-    rooms = tuple(
-        Room(rect, use, tuple(holes))
-        for rect, use, holes in zip(rects, uses, openings, strict=True)
-    )
+    rooms = tuple(map(Room, rects, uses, map(tuple, openings)))
     passages = tuple(
         (a, b, _passage(cells[a], side, low, high)) for a, b, side, low, high in doorways
     )
@@ -104,21 +95,18 @@ def _split(rng: np.random.Generator, count: int) -> list[Rect]:
         width = round(float(np.sqrt(area * aspect)), 1)
         cells: list[Rect] = [(0.0, 0.0, width, round(area / width, 1))]
         while len(cells) < count:
-            sizes = np.array([(c[2] - c[0]) * (c[3] - c[1]) for c in cells])
-            pick = int(rng.choice(len(cells), p=sizes**2 / (sizes**2).sum()))
-            if (
-                max(cells[pick][2] - cells[pick][0], cells[pick][3] - cells[pick][1])
-                < 2 * MIN_ROOM_SIDE_M
-            ):
-                pick = int(sizes.argmax())
+            sides = np.array([(x1 - x0, y1 - y0) for x0, y0, x1, y1 in cells])
+            areas = sides.prod(1)
+            pick = int(rng.choice(len(cells), p=areas**2 / (areas**2).sum()))
+            if sides[pick].max() < 2 * MIN_ROOM_SIDE_M:
+                pick = int(areas.argmax())
             x0, y0, x1, y1 = cells.pop(pick)
             across, fraction = x1 - x0 > y1 - y0, rng.uniform(0.36, 0.64)
             length = x1 - x0 if across else y1 - y0
             if length < 2 * MIN_ROOM_SIDE_M:
                 break
-            cut = round(
-                float(np.clip(fraction * length, MIN_ROOM_SIDE_M, length - MIN_ROOM_SIDE_M)), 2
-            )
+            cut = np.clip(fraction * length, MIN_ROOM_SIDE_M, length - MIN_ROOM_SIDE_M)
+            cut = round(float(cut), 2)
             if across:
                 cells += [(x0, y0, x0 + cut, y1), (x0 + cut, y0, x1, y1)]
             else:
@@ -165,10 +153,6 @@ def _doorways(
         start = rng.uniform(low + 0.2, high - 0.2 - width)
         chosen.append((a, b, side, round(start, 2), round(start + width, 2)))
     return chosen
-
-
-def _inset(rect: Rect, by: float) -> Rect:
-    return rect[0] + by, rect[1] + by, rect[2] - by, rect[3] - by
 
 
 def _passage(cell: Rect, side: int, low: float, high: float) -> Rect:
@@ -224,11 +208,6 @@ def against(room: Room, side: int, at: float, depth: float, width: float) -> Rec
     )[side]
 
 
-def doorway_clearance(room: Room, side: int, low: float, high: float) -> Rect:
-    """Return the floor in front of a doorway that must stay free: 0.75 m deep."""
-    return against(room, side, (low + high) / 2, 0.75, high - low)
-
-
 def shift(x: float, y: float) -> np.ndarray:
     """Return the (4, 4) translation by (x, y)."""
     pose = np.eye(4)
@@ -259,9 +238,7 @@ CLEAR_M = 0.33
 def all_reachable(plan: FloorPlan, footprints: list[Rect]) -> bool:
     """Return whether free floor joins all doorways and covers part of every room.
 
-    Args:
-        plan: rooms and doorways.
-        footprints: rectangles on the ground occupied by furniture.
+    ``footprints`` are the rectangles on the ground occupied by furniture.
     """
     rects = np.array([room.rect for room in plan.rooms])
     origin = rects[:, :2].min(0) - 2 * CELL_M
@@ -272,16 +249,21 @@ def all_reachable(plan: FloorPlan, footprints: list[Rect]) -> bool:
     for rect in footprints:
         floor[_cells(rect, origin)] = False
     distance = np.asarray(ndimage.distance_transform_edt(floor)) * CELL_M
-    labels = np.zeros(floor.shape, np.int32)
-    ndimage.label(distance >= CLEAR_M, output=labels)
-    if not labels.any():
-        return False
-    largest = 1 + int(np.bincount(labels.ravel())[1:].argmax())
+    region = largest_region(distance >= CLEAR_M)
     for _, _, (x0, y0, x1, y1) in plan.doorways:
         column, row = ((np.array([x0 + x1, y0 + y1]) / 2 - origin) / CELL_M).astype(int)
-        if labels[row, column] != largest:
+        if not region[row, column]:
             return False
-    return all((labels[_cells(rect, origin)] == largest).any() for rect in rects)
+    return all(region[_cells(rect, origin)].any() for rect in rects)
+
+
+def largest_region(free_YX: np.ndarray) -> np.ndarray:
+    """Return the largest region of free cells, joined by sides; empty if no cell is free."""
+    labels = np.zeros(free_YX.shape, np.int32)
+    ndimage.label(free_YX, output=labels)
+    sizes = np.bincount(labels.ravel())
+    sizes[0] = 0
+    return (labels == sizes.argmax()) & free_YX
 
 
 def _cells(rect: Rect | np.ndarray, origin_2: np.ndarray) -> tuple[slice, slice]:

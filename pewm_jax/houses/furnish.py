@@ -7,18 +7,14 @@ of the room.
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
-
 import numpy as np
-from scipy import ndimage
 
 from pewm_jax.houses import fixtures, furniture
 from pewm_jax.houses.floorplan import (
     Rect,
     Room,
     against,
-    doorway_clearance,
+    largest_region,
     overlap,
     shift,
     turned,
@@ -26,76 +22,26 @@ from pewm_jax.houses.floorplan import (
 )
 from pewm_jax.houses.shapes import Palette, Piece
 
-Maker = Callable[[np.random.Generator, Palette], Piece]
-"""Builds one piece of furniture from random numbers and a room's palette."""
-
-FURNITURE: dict[str, tuple[tuple[Maker, ...], tuple[Maker, ...]]] = {
-    "living": (
-        (furniture.sofa, furniture.tv_stand, furniture.bookshelf),
+FURNITURE: dict[str, tuple[list[str], list[str]]] = {
+    use: (first.split(), then.split())
+    for use, first, then in (
         (
-            furniture.armchair,
-            fixtures.plant,
-            fixtures.floor_lamp,
-            fixtures.fireplace,
-            fixtures.piano,
-            furniture.dresser,
-            furniture.armchair,
-            fixtures.plant,
+            "living",
+            "sofa tv_stand bookshelf",
+            "armchair plant floor_lamp fireplace piano dresser armchair plant",
         ),
-    ),
-    "bedroom": (
-        (furniture.bed, furniture.wardrobe, furniture.nightstand),
         (
-            furniture.dresser,
-            fixtures.plant,
-            fixtures.floor_lamp,
-            furniture.armchair,
-            furniture.bookshelf,
-            furniture.desk,
+            "bedroom",
+            "bed wardrobe nightstand",
+            "dresser plant floor_lamp armchair bookshelf desk",
         ),
-    ),
-    "kitchen": (
-        (fixtures.kitchen_counter, fixtures.fridge, fixtures.stove),
-        (fixtures.plant, furniture.dresser, fixtures.kitchen_counter),
-    ),
-    "bathroom": (
-        (fixtures.bathtub, fixtures.toilet, fixtures.washbasin),
-        (fixtures.washing_machine, fixtures.plant, furniture.dresser),
-    ),
-    "study": (
-        (furniture.desk, furniture.bookshelf, furniture.bookshelf),
-        (furniture.armchair, fixtures.floor_lamp, fixtures.plant, furniture.sofa, fixtures.piano),
-    ),
-    "dining": (
-        (furniture.dresser, fixtures.plant),
-        (
-            fixtures.fireplace,
-            fixtures.floor_lamp,
-            furniture.bookshelf,
-            fixtures.piano,
-            fixtures.plant,
-        ),
-    ),
-    "kids": (
-        (furniture.bed, fixtures.toy_chest, furniture.wardrobe),
-        (
-            furniture.desk,
-            furniture.bookshelf,
-            fixtures.toy_chest,
-            fixtures.plant,
-            fixtures.floor_lamp,
-        ),
-    ),
-    "hall": (
-        (fixtures.coat_rack, furniture.dresser),
-        (
-            fixtures.plant,
-            furniture.wardrobe,
-            fixtures.floor_lamp,
-            furniture.armchair,
-            furniture.bookshelf,
-        ),
-    ),
+        ("kitchen", "kitchen_counter fridge stove", "plant dresser kitchen_counter"),
+        ("bathroom", "bathtub toilet washbasin", "washing_machine plant dresser"),
+        ("study", "desk bookshelf bookshelf", "armchair floor_lamp plant sofa piano"),
+        ("dining", "dresser plant", "fireplace floor_lamp bookshelf piano plant"),
+        ("kids", "bed toy_chest wardrobe", "desk bookshelf toy_chest plant floor_lamp"),
+        ("hall", "coat_rack dresser", "plant wardrobe floor_lamp armchair bookshelf"),
+    )
 }
 """For each use of a room: the furniture placed first, and the furniture placed as space allows."""
 DINING_TABLE_PROBABILITY = {"kitchen": 0.7, "dining": 1.0, "living": 0.25}
@@ -108,7 +54,7 @@ RUG_PROBABILITY = {
     "hall": 0.6,
     "dining": 0.4,
 }
-"""Probability of a rug."""
+"""Probability of a rug, 0.3 for the other uses."""
 
 
 CLEAR_M = 0.32
@@ -119,56 +65,55 @@ TRIES = 12
 """Random positions tried for a piece before it is skipped."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Placed:
-    """A piece of furniture and its pose ``world_from_piece`` (4, 4)."""
-
-    piece: Piece
-    world_from_piece: np.ndarray
-
-
 class Furnisher:
     """Places furniture in one room and tracks which walls and floor cells are occupied."""
 
     def __init__(self, room: Room, rng: np.random.Generator, palette: Palette, height: float):
         """Start with the bare room."""
         self.room, self.rng, self.palette, self.height = room, rng, palette, height
-        self.placed: list[Placed] = []
+        self.placed: list[tuple[Piece, np.ndarray]] = []
         self.footprints: list[Rect] = []
         self._last = (0, 0.0, 0.0)  # side, place along it and width of the last piece at a wall
         self.used: list[list[Rect]] = [[] for _ in range(4)]
+        self.doors: list[Rect] = []  # the floor in front of doorways that must stay free
         for hole in room.openings:
-            gap = 0.12
+            gap, width = 0.12, hole.high - hole.low
             self.used[hole.side].append((hole.low - gap, hole.bottom, hole.high + gap, hole.top))
-        self.doors = [
-            doorway_clearance(room, hole.side, hole.low, hole.high)
-            for hole in room.openings
-            if hole.kind == "door"
-        ]
+            if hole.kind == "door":
+                middle = (hole.low + hole.high) / 2
+                self.doors.append(against(room, hole.side, middle, 0.75, width))
         x0, y0, x1, y1 = room.rect
         self.shape = (int((y1 - y0) / CELL_M) + 1, int((x1 - x0) / CELL_M) + 1)
         self.blocked = np.ones(self.shape, bool)
-        self.blocked[self._cells((x0, y0, x1, y1), -CLEAR_M)] = False
+        self.blocked[self._cells(room.rect, -CLEAR_M)] = False
         self.open_cells = int((~self.blocked).sum())
 
-    def furnish(self) -> list[Placed]:
-        """Place the furniture that belongs to the room's use, then decorate."""
+    def make(self, kind: str) -> Piece:
+        """Build a piece of furniture in the room's colours."""
+        maker = getattr(furniture, kind, None) or getattr(fixtures, kind)
+        return maker(self.rng, self.palette)
+
+    def furnish(self) -> list[tuple[Piece, np.ndarray]]:
+        """Place the furniture that belongs to the room's use, then decorate.
+
+        Return pieces and poses.
+        """
         rng, use = self.rng, self.room.use
         required, optional = FURNITURE[use]
-        for maker in required:
-            if not self.at_wall(maker(rng, self.palette)):
+        for kind in required:
+            if not self.at_wall(self.make(kind)):
                 continue
-            if maker is furniture.bed:
-                self.beside_last(furniture.nightstand(rng, self.palette))
-            elif maker is furniture.desk:
-                self.before_last(furniture.office_chair(rng, self.palette), 0.72, turned=True)
-            elif maker is furniture.sofa and rng.uniform() < 0.8:
-                self.before_last(furniture.coffee_table(rng, self.palette), 1.25, turned=False)
+            if kind == "bed":
+                self.beside_last(self.make("nightstand"))
+            elif kind == "desk":
+                self.before_last(self.make("office_chair"), 0.72, turned=True)
+            elif kind == "sofa" and rng.uniform() < 0.8:
+                self.before_last(self.make("coffee_table"), 1.25, turned=False)
         if rng.uniform() < DINING_TABLE_PROBABILITY.get(use, 0.0):
             self.table_with_chairs()
         for index in rng.permutation(len(optional)):
             if rng.uniform() < 0.85:
-                self.at_wall(optional[index](rng, self.palette))
+                self.at_wall(self.make(optional[index]))
         self.decorate()
         return self.placed
 
@@ -178,75 +123,60 @@ class Furnisher:
         if rng.uniform() < RUG_PROBABILITY.get(self.room.use, 0.3):
             self.rug()
         if rng.uniform() < 0.3:
-            self.hang(fixtures.clock(rng, self.palette), 1.6)
+            self.hang(self.make("clock"), 1.6)
         if rng.uniform() < 0.7:
-            self.hang(fixtures.wall_shelf(rng, self.palette), 1.1)
+            self.hang(self.make("wall_shelf"), 1.1)
         for _ in range(int(rng.integers(3, 6))):
-            self.hang(fixtures.picture(rng, self.palette), rng.uniform(1.25, 1.45))
-        self.ceiling_lamp()
+            self.hang(self.make("picture"), rng.uniform(1.25, 1.45))
+        x0, y0, x1, y1 = self.room.rect
+        pose = shift((x0 + x1) / 2, (y0 + y1) / 2)
+        pose[2, 3] = self.height
+        self.placed.append((self.make("ceiling_lamp"), pose))
 
     def at_wall(self, piece: Piece) -> bool:
         """Put a piece with its back to a random wall; return whether a position was found."""
-        width, depth, high = piece.size
+        width = piece.size[0]
         for _ in range(TRIES):
             side = int(self.rng.integers(4))
-            low, high_end = self.room.span(side)
-            if high_end - low < width + 0.1:
+            low, high = self.room.span(side)
+            if high - low < width + 0.1:
                 continue
             if self.rng.uniform() < 0.35:
                 at = low + width / 2 + 0.03
             elif self.rng.uniform() < 0.5:
-                at = high_end - width / 2 - 0.03
+                at = high - width / 2 - 0.03
             else:
-                at = self.rng.uniform(low + width / 2 + 0.03, high_end - width / 2 - 0.03)
-            span = (at - width / 2, 0.0, at + width / 2, high)
-            if any(overlap(span, other) for other in self.used[side]):
-                continue
-            if self._stand(piece, against(self.room, side, at, depth, width), side, at):
-                self.used[side].append(span)
+                at = self.rng.uniform(low + width / 2 + 0.03, high - width / 2 - 0.03)
+            if self._stand(piece, side, at):
                 return True
         return False
 
-    def beside_last(self, piece: Piece) -> bool:
+    def beside_last(self, piece: Piece) -> None:
         """Put a piece at the wall next to the last one."""
         side, at, width = self._last
+        half = piece.size[0] / 2
         for sign in self.rng.permutation([-1, 1]):
-            centre = at + sign * (width / 2 + piece.size[0] / 2 + 0.04)
+            centre = at + sign * (width / 2 + half + 0.04)
             low, high = self.room.span(side)
-            if not low + piece.size[0] / 2 <= centre <= high - piece.size[0] / 2:
-                continue
-            span = (centre - piece.size[0] / 2, 0.0, centre + piece.size[0] / 2, piece.size[2])
-            if any(overlap(span, other) for other in self.used[side]):
-                continue
-            rect = against(self.room, side, centre, piece.size[1], piece.size[0])
-            if self._stand(piece, rect, side, centre):
-                self.used[side].append(span)
-                return True
-        return False
+            if low + half <= centre <= high - half and self._stand(piece, side, centre):
+                return
 
-    def before_last(self, piece: Piece, distance: float, *, turned: bool) -> bool:
+    def before_last(self, piece: Piece, distance: float, *, turned: bool) -> None:
         """Put a piece in front of the last one at a wall, facing it (``turned``) or facing away."""
         side, at, _ = self._last
-        frame = wall_frame(self.room, side, at)
-        depth = piece.size[1]
-        local = np.eye(4)
-        if turned:
-            local[:2, :2] *= -1
-            local[1, 3] = distance + depth
-        else:
-            local[1, 3] = distance
-        pose = frame @ local
-        return self._free_standing(piece, pose)
+        local = shift(0, distance + piece.size[1] * turned)
+        local[:2, :2] *= -1 if turned else 1
+        self._free_standing(piece, wall_frame(self.room, side, at) @ local)
 
-    def table_with_chairs(self) -> bool:
+    def table_with_chairs(self) -> None:
         """Put a dining table somewhere in the room with chairs around it."""
-        rng, x0y0x1y1 = self.rng, self.room.rect
-        table = furniture.dining_table(rng, self.palette)
+        rng, rect = self.rng, self.room.rect
+        table = self.make("dining_table")
         for _ in range(2 * TRIES):
             turn = int(rng.integers(2))
-            w, d = table.size[:2] if turn == 0 else table.size[1::-1]
-            low = [x0y0x1y1[i] + 0.8 + s / 2 for i, s in enumerate((w, d))]
-            high = [x0y0x1y1[i + 2] - 0.8 - s / 2 for i, s in enumerate((w, d))]
+            sides = table.size[:2] if turn == 0 else table.size[1::-1]
+            low = [rect[i] + 0.8 + s / 2 for i, s in enumerate(sides)]
+            high = [rect[i + 2] - 0.8 - s / 2 for i, s in enumerate(sides)]
             if low[0] > high[0] or low[1] > high[1]:
                 continue
             centre = [rng.uniform(*ends) for ends in zip(low, high, strict=True)]
@@ -261,70 +191,63 @@ class Furnisher:
                 there = np.sign(y) * (middle + 0.12)
                 local = shift(x, middle + there) @ turned(k, (0, 0)) @ shift(0, -0.3)
                 self._free_standing(chair, pose @ local, margin=-0.2)
-            return True
-        return False
+            return
 
     def rug(self) -> None:
         """Lay a rug in the middle."""
-        piece = fixtures.rug(self.rng, self.palette)
+        piece = self.make("rug")
         x0, y0, x1, y1 = self.room.rect
         turn = int(y1 - y0 > x1 - x0)
         w, d = piece.size[:2] if turn == 0 else piece.size[1::-1]
         if x1 - x0 > w + 0.4 and y1 - y0 > d + 0.4:
             middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2]) + self.rng.uniform(-0.15, 0.15, 2)
             pose = turned(turn, middle) @ shift(0, -piece.size[1] / 2)
-            self.placed.append(Placed(piece, pose))
+            self.placed.append((piece, pose))
 
     def hang(self, piece: Piece, bottom: float) -> None:
         """Hang a piece on a free stretch of wall."""
-        width, _, high = piece.size
+        width, depth, high = piece.size
         for _ in range(TRIES):
             side = int(self.rng.integers(4))
             low, end = self.room.span(side)
             if end - low < width + 0.3:
                 continue
             at = self.rng.uniform(low + width / 2 + 0.12, end - width / 2 - 0.12)
-            span = (
-                at - width / 2 - 0.06,
-                bottom - 0.05,
-                at + width / 2 + 0.06,
-                bottom + high + 0.05,
-            )
+            half = width / 2
+            span = (at - half - 0.06, bottom - 0.05, at + half + 0.06, bottom + high + 0.05)
             if any(overlap(span, other) for other in self.used[side]):
                 continue
             # Pieces that reach far into the room also block the floor: cameras pass below them.
-            rect = against(self.room, side, at, piece.size[1], width)
-            if piece.size[1] < 0.1 or self._accept(rect, over_others=True):
+            rect = against(self.room, side, at, depth, width)
+            if depth < 0.1 or self._accept(rect, over_others=True):
                 pose = wall_frame(self.room, side, at)
                 pose[2, 3] = bottom
-                self.placed.append(Placed(piece, pose))
+                self.placed.append((piece, pose))
                 self.used[side].append(span)
                 return
 
-    def ceiling_lamp(self) -> None:
-        """Hang a lamp from the middle of the ceiling."""
-        x0, y0, x1, y1 = self.room.rect
-        pose = shift((x0 + x1) / 2, (y0 + y1) / 2)
-        pose[2, 3] = self.height
-        self.placed.append(Placed(fixtures.ceiling_lamp(self.rng, self.palette), pose))
-
-    def _stand(self, piece: Piece, rect: Rect, side: int, at: float) -> bool:
-        if not self._accept(rect):
+    def _stand(self, piece: Piece, side: int, at: float) -> bool:
+        """Put a piece with its back to a wall if wall and floor are free; return whether so."""
+        width, depth, high = piece.size
+        span = (at - width / 2, 0.0, at + width / 2, high)
+        if any(overlap(span, other) for other in self.used[side]):
             return False
-        self.placed.append(Placed(piece, wall_frame(self.room, side, at)))
-        self._last = (side, at, piece.size[0])
+        if not self._accept(against(self.room, side, at, depth, width)):
+            return False
+        self.placed.append((piece, wall_frame(self.room, side, at)))
+        self.used[side].append(span)
+        self._last = (side, at, width)
         return True
 
     def _free_standing(self, piece: Piece, pose: np.ndarray, margin: float = 0.0) -> bool:
         half, depth = piece.size[0] / 2, piece.size[1]
-        corners = np.array([[-half, 0, 0, 1], [half, depth, 0, 1]]) @ pose.T
-        low, high = corners[:, :2].min(0), corners[:, :2].max(0)
-        rect = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        corners = (np.array([[-half, 0, 0, 1], [half, depth, 0, 1]]) @ pose.T)[:, :2]
+        left, near, right, far = map(float, (*corners.min(0), *corners.max(0)))
         x0, y0, x1, y1 = self.room.rect
-        inside = rect[0] > x0 and rect[1] > y0 and rect[2] < x1 and rect[3] < y1
-        if not inside or not self._accept(rect, margin):
+        inside = left > x0 and near > y0 and right < x1 and far < y1
+        if not inside or not self._accept((left, near, right, far), margin):
             return False
-        self.placed.append(Placed(piece, pose))
+        self.placed.append((piece, pose))
         return True
 
     def _accept(self, rect: Rect, margin: float = 0.0, *, over_others: bool = False) -> bool:
@@ -353,19 +276,14 @@ class Furnisher:
     def _reachable(self) -> bool:
         """Return whether one region of free floor has all doorways and most of the free cells."""
         free = ~self.blocked
-        labels = np.zeros(free.shape, np.int32)
-        ndimage.label(free, output=labels)
-        if not free.any():
-            return False
-        sizes = np.bincount(labels.ravel())[1:]
-        largest = int(sizes.argmax()) + 1
-        if sizes[largest - 1] < max(0.22 * self.open_cells, 0.85 * sizes.sum()):
+        region = largest_region(free)
+        if not free.any() or region.sum() < max(0.22 * self.open_cells, 0.85 * free.sum()):
             return False
         x0, y0 = self.room.rect[:2]
         for door in self.doors:
             cx, cy = (door[0] + door[2]) / 2, (door[1] + door[3]) / 2
             row = np.clip(int((cy - y0) / CELL_M), 0, self.shape[0] - 1)
             column = np.clip(int((cx - x0) / CELL_M), 0, self.shape[1] - 1)
-            if labels[row, column] != largest:
+            if not region[row, column]:
                 return False
         return True

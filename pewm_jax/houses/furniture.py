@@ -58,19 +58,14 @@ def dresser(rng: np.random.Generator, palette: Palette) -> Piece:
     colour = palette.second if rng.uniform() < 0.5 else palette.wood
     piece = Piece("dresser", (width, depth + 0.03, high + 0.4))
     piece.box((-width / 2, width / 2), (0, depth), (0.05, high), colour)
-    rows = 3
+    rows, front = 3, (depth, depth + 0.02)
     for k in range(rows):
         z = 0.1 + k * (high - 0.12) / rows
         for x in (-width / 2 + 0.03, 0.015):
-            piece.box(
-                (x, x + width / 2 - 0.045),
-                (depth, depth + 0.02),
-                (z, z + (high - 0.12) / rows - 0.04),
-                shade(colour, 1.25),
-            )
-    small_objects(
-        piece, rng, (-width / 2 + 0.1, width / 2 - 0.1), (0.1, depth - 0.08), z=high, count=3
-    )
+            drawer = (x, x + width / 2 - 0.045), front, (z, z + (high - 0.12) / rows - 0.04)
+            piece.box(*drawer, shade(colour, 1.25))
+    inner = (-width / 2 + 0.1, width / 2 - 0.1)
+    small_objects(piece, rng, inner, (0.1, depth - 0.08), z=high, count=3)
     return piece
 
 
@@ -84,18 +79,12 @@ def bookshelf(rng: np.random.Generator, palette: Palette) -> Piece:
         piece.box((x, x + 0.03), (0.02, depth), (0, high), palette.wood)
     count = int(high / 0.38)
     step = (high - 0.1) / count
+    inner = (-half + 0.04, half - 0.04)
     for k in range(count + 1):
         z = 0.06 + k * step
         piece.box((-half + 0.03, half - 0.03), (0.02, depth), (z, z + 0.03), palette.wood)
         if k < count:
-            books(
-                piece,
-                rng,
-                (-half + 0.04, half - 0.04),
-                (0.06, depth - 0.03),
-                z=z + 0.03,
-                tallest=step - 0.05,
-            )
+            books(piece, rng, inner, (0.06, depth - 0.03), z=z + 0.03, tallest=step - 0.05)
     return piece
 
 
@@ -123,9 +112,8 @@ def _seating(
     piece.box((-half + 0.18, half - 0.18), (0.24, depth - 0.02), (0.06, 0.3), shade(cloth, 0.8))
     for k in range(seats):
         x = -inner / 2 + k * inner / seats
-        piece.box(
-            (x + 0.01, x + inner / seats - 0.01), (0.24, depth), (0.3, 0.45), shade(cloth, 1.15)
-        )
+        seat = (x + 0.01, x + inner / seats - 0.01)
+        piece.box(seat, (0.24, depth), (0.3, 0.45), shade(cloth, 1.15))
     for k in range(seats):
         if seats == 1 or rng.uniform() < 0.7:
             x = -inner / 2 + (k + 0.5) * inner / seats
@@ -143,7 +131,7 @@ def coffee_table(rng: np.random.Generator, palette: Palette) -> Piece:
     else:
         piece = Piece("coffee_table", (1.05, 0.58, 0.42))
         piece.box((-0.52, 0.52), (0, 0.58), (0.36, 0.42), palette.wood)
-        legs(piece, 1.0, (0.02, 0.56), top=0.36, thick=0.06, colour=shade(palette.wood, 0.7))
+        legs(piece, 1.0, (0.02, 0.56), 0.36, 0.06, shade(palette.wood, 0.7))
     small_objects(piece, rng, (-0.3, 0.3), (0.2, 0.42), z=0.42, count=2)
     return piece
 
@@ -155,9 +143,8 @@ def tv_stand(rng: np.random.Generator, palette: Palette) -> Piece:
     piece.box((-width / 2, width / 2), (0, 0.42), (0.08, 0.48), palette.wood)
     for k in range(3):
         x = -width / 2 + 0.03 + k * (width - 0.03) / 3
-        piece.box(
-            (x, x + (width - 0.12) / 3), (0.42, 0.435), (0.14, 0.42), shade(palette.wood, 1.3)
-        )
+        door = (x, x + (width - 0.12) / 3)
+        piece.box(door, (0.42, 0.435), (0.14, 0.42), shade(palette.wood, 1.3))
     piece.box((-0.12, 0.12), (0.12, 0.28), (0.48, 0.54), palette.dark)
     half = rng.uniform(0.5, 0.62)
     piece.box((-half, half), (0.16, 0.22), (0.54, 0.54 + 1.16 * half), np.array([0.06, 0.06, 0.07]))
@@ -177,14 +164,7 @@ def dining_table(rng: np.random.Generator, palette: Palette) -> Piece:
         piece = Piece("dining_table", (rng.uniform(1.2, 1.6), 0.85, 0.76))
         width = piece.size[0]
         piece.box((-width / 2, width / 2), (0, 0.85), (0.71, 0.76), palette.wood)
-        legs(
-            piece,
-            width - 0.06,
-            (0.03, 0.82),
-            top=0.71,
-            thick=0.07,
-            colour=shade(palette.wood, 0.75),
-        )
+        legs(piece, width - 0.06, (0.03, 0.82), 0.71, 0.07, shade(palette.wood, 0.75))
     middle = piece.size[1] / 2
     piece.prism((0, middle), (0.76, 0.9), (0.08, 0.15), palette.accent, 10)
     for k in range(3):
@@ -198,7 +178,7 @@ def chair(rng: np.random.Generator, palette: Palette) -> Piece:
     """A wooden chair; its back is at y = 0."""
     colour = palette.wood if rng.uniform() < 0.5 else palette.accent
     piece = Piece("chair", (0.44, 0.46, 0.9))
-    legs(piece, 0.42, (0, 0.44), top=0.43, thick=0.045, colour=shade(colour, 0.75))
+    legs(piece, 0.42, (0, 0.44), 0.43, 0.045, shade(colour, 0.75))
     piece.box((-0.22, 0.22), (0, 0.46), (0.43, 0.48), shade(colour, 1.1))
     for x in (-0.21, 0.165):
         piece.box((x, x + 0.045), (0, 0.045), (0.48, 0.9), shade(colour, 0.75))
@@ -213,10 +193,9 @@ def desk(rng: np.random.Generator, palette: Palette) -> Piece:
     half = width / 2
     piece.box((-half, half), (0, 0.66), (0.7, 0.75), palette.wood)
     piece.box((half - 0.42, half - 0.02), (0.04, 0.62), (0.05, 0.7), palette.second)
+    drawer = (half - 0.4, half - 0.04), (0.62, 0.635)
     for z in (0.1, 0.3, 0.5):
-        piece.box(
-            (half - 0.4, half - 0.04), (0.62, 0.635), (z, z + 0.17), shade(palette.second, 1.25)
-        )
+        piece.box(*drawer, (z, z + 0.17), shade(palette.second, 1.25))
     piece.box((-half, -half + 0.06), (0.02, 0.64), (0, 0.7), shade(palette.wood, 0.8))
     dark = np.array([0.08, 0.08, 0.1])
     piece.box((-0.06, 0.06), (0.14, 0.22), (0.75, 0.85), dark)

@@ -8,39 +8,12 @@ OTHER = "other"
 """The kind of parts whose name is not informative, such as those of a user's mesh."""
 SHELL = ("wall", "floor", "ceiling", "trim", "doorway", "window")
 MOVING = ("door", "robot")
-FURNITURE = (
-    "armchair",
-    "bathtub",
-    "bed",
-    "bookshelf",
-    "ceiling_lamp",
-    "chair",
-    "clock",
-    "coat_rack",
-    "coffee_table",
-    "desk",
-    "dining_table",
-    "dresser",
-    "fireplace",
-    "floor_lamp",
-    "fridge",
-    "kitchen_counter",
-    "nightstand",
-    "office_chair",
-    "piano",
-    "picture",
-    "plant",
-    "rug",
-    "sofa",
-    "stove",
-    "toilet",
-    "toy_chest",
-    "tv_stand",
-    "wall_shelf",
-    "wardrobe",
-    "washbasin",
-    "washing_machine",
-)
+_FURNITURE = """
+armchair bathtub bed bookshelf ceiling_lamp chair clock coat_rack coffee_table desk dining_table
+dresser fireplace floor_lamp fridge kitchen_counter nightstand office_chair piano picture plant rug
+sofa stove toilet toy_chest tv_stand wall_shelf wardrobe washbasin washing_machine
+"""
+FURNITURE = tuple(_FURNITURE.split())
 KINDS = (OTHER, *SHELL, *MOVING, *FURNITURE)
 """All kinds; their order is part of the data format, so new ones go last."""
 GROUPS = {

@@ -11,6 +11,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -22,6 +23,8 @@ from pewm_jax.houses.textures import Rgb, hsv
 
 Colour = Sequence[float] | np.ndarray
 """Red, green, blue in [0, 1]."""
+Span = tuple[float, float]
+"""Begin and end along an axis, metres."""
 
 _QUADS = np.array(
     [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
@@ -39,6 +42,8 @@ class Piece:
     Attributes:
         kind: what it is, e.g. ``sofa``.
         size: width along the wall, depth away from it, height; the space it needs, metres.
+        meshes: vertices, triangles and the colour of each shape; boxes come first.
+        sheets: corners and image of each picture, and whether it glows.
     """
 
     kind: str
@@ -49,21 +54,12 @@ class Piece:
     )
     sheets: list[tuple[np.ndarray, np.ndarray, bool]] = dataclasses.field(default_factory=list)
 
-    def box(
-        self, x: tuple[float, float], y: tuple[float, float], z: tuple[float, float], colour: Colour
-    ) -> None:
+    def box(self, x: Span, y: Span, z: Span, colour: Colour) -> None:
         """Add an axis-aligned box given its three intervals."""
         r, g, b = colour
         self.boxes.append((x[0], y[0], z[0], x[1], y[1], z[1], r, g, b))
 
-    def prism(
-        self,
-        centre: tuple[float, float],
-        z: tuple[float, float],
-        radius: tuple[float, float],
-        colour: Colour,
-        sides: int = 10,
-    ) -> None:
+    def prism(self, centre: Span, z: Span, radius: Span, colour: Colour, sides: int = 10) -> None:
         """Add an upright prism, cone or frustum: radius at the bottom and at the top."""
         points, faces = _unit_prism(sides)
         scale = np.where(points[:, 2:] > 0, radius[1], radius[0])
@@ -77,31 +73,28 @@ class Piece:
         placed = points * np.asarray(radii) + np.asarray(centre)
         self.meshes.append((placed, faces, np.asarray(colour, float)))
 
-    def sheet(
-        self, corners_43: Sequence[Sequence[float]], image: np.ndarray, *, glowing: bool = False
-    ) -> None:
+    def sheet(self, corners_43: Any, image: np.ndarray, *, glowing: bool = False) -> None:
         """Add a picture: corners bottom-left, bottom-right, top-right, top-left as seen."""
         self.sheets.append((np.asarray(corners_43, float), image, glowing))
 
     def solid(self) -> trimesh.Trimesh | None:
         """Return everything but the sheets as one mesh with vertex colours."""
-        vertices, faces, colours = [], [], []
+        shapes = list(self.meshes)
         if self.boxes:
             table = np.array(self.boxes)
             low, high = table[:, None, :3], table[:, None, 3:6]
-            vertices.append((low + BOX_24 * (high - low)).reshape(-1, 3))
-            offset = 24 * np.arange(len(table))[:, None, None]
-            faces.append((BOX_FACES + offset).reshape(-1, 3))
-            colours.append(np.repeat(table[:, 6:], 24, 0))
-        start = sum(len(v) for v in vertices)
-        for points, triangles, colour in self.meshes:
-            vertices.append(points)
-            faces.append(triangles + start)
-            colours.append(np.broadcast_to(colour, points.shape))
-            start += len(points)
-        if not vertices:
+            corners = (low + BOX_24 * (high - low)).reshape(-1, 3)
+            faces = BOX_FACES + 24 * np.arange(len(table))[:, None, None]
+            shapes.insert(0, (corners, faces.reshape(-1, 3), np.repeat(table[:, 6:], 24, 0)))
+        if not shapes:
             return None
-        return coloured(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colours))
+        vertices, faces, colours = zip(*shapes, strict=True)
+        starts = np.cumsum([0, *map(len, vertices[:-1])])
+        return coloured(
+            np.concatenate(vertices),
+            np.concatenate([part + start for part, start in zip(faces, starts, strict=True)]),
+            np.concatenate(list(map(np.broadcast_to, colours, (v.shape for v in vertices)))),
+        )
 
     def pictures(self) -> list[trimesh.Trimesh]:
         """Return the sheets as textured meshes."""
@@ -182,15 +175,7 @@ def bright(rng: np.random.Generator) -> Rgb:
     return hsv(rng.uniform(), rng.uniform(0.55, 0.9), rng.uniform(0.5, 0.95))
 
 
-def legs(
-    piece: Piece,
-    width: float,
-    y: tuple[float, float],
-    *,
-    top: float,
-    thick: float,
-    colour: Rgb,
-) -> None:
+def legs(piece: Piece, width: float, y: Span, top: float, thick: float, colour: Rgb) -> None:
     """Add four legs under a top of that width between two depths."""
     for x0 in (-width / 2, width / 2 - thick):
         for y0 in (y[0], y[1] - thick):
@@ -198,13 +183,7 @@ def legs(
 
 
 def books(
-    piece: Piece,
-    rng: np.random.Generator,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    *,
-    z: float,
-    tallest: float,
+    piece: Piece, rng: np.random.Generator, x: Span, y: Span, *, z: float, tallest: float
 ) -> None:
     """Fill a shelf with books of many colours, here and there a vase or a box."""
     at = x[0]
@@ -213,9 +192,8 @@ def books(
         if what < 0.72:
             width = min(rng.uniform(0.06, 0.13), x[1] - at)
             high = z + tallest * rng.uniform(0.6, 0.95)
-            piece.box(
-                (at, at + width * 0.94), (y[0], y[1] - rng.uniform(0, 0.05)), (z, high), bright(rng)
-            )
+            deep = (y[0], y[1] - rng.uniform(0, 0.05))
+            piece.box((at, at + width * 0.94), deep, (z, high), bright(rng))
             at += width
         elif what < 0.86 and x[1] - at > 0.2:
             centre = (at + 0.1, (y[0] + y[1]) / 2)
@@ -226,13 +204,7 @@ def books(
 
 
 def small_objects(
-    piece: Piece,
-    rng: np.random.Generator,
-    x: tuple[float, float],
-    y: tuple[float, float],
-    *,
-    z: float,
-    count: int,
+    piece: Piece, rng: np.random.Generator, x: Span, y: Span, *, z: float, count: int
 ) -> None:
     """Put vases, boxes, bowls, small plants and balls next to each other on a top."""
     edges = np.linspace(x[0], x[1], count + 1)

@@ -42,6 +42,17 @@ def _noise(rng: np.random.Generator, height: int, width: int, cells: int) -> np.
     return big if big.shape == (height, width) else cv2.resize(big, (width, height))
 
 
+def _paint(image_HW3: np.ndarray, mask_HW: np.ndarray, colour: Rgb | float) -> np.ndarray:
+    """Return an image that has another colour, or another image, in a mask."""
+    return np.where(mask_HW[..., None], colour, image_HW3)
+
+
+def _unit(side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (y, x) of a square image from its top left, 0 to 1, texel centres."""
+    y, x = (np.mgrid[0:side, 0:side] + 0.5) / side
+    return y, x
+
+
 def _grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """Return (y, x) in metres from the top left, texel centres."""
     y, x = np.mgrid[0:height, 0:width]
@@ -51,11 +62,7 @@ def _grid(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 def wall(rng: np.random.Generator, colour: Rgb, height_m: float, style: str) -> np.ndarray:
     """Return a wall covering 2 m wide that spans the room's height.
 
-    Args:
-        rng: source of the details.
-        colour: main colour.
-        height_m: room height, metres.
-        style: plaster, stripes, wainscot, diamonds, bricks or band.
+    The style is plaster, stripes, wainscot, diamonds, bricks or band.
     """
     height, width = round(height_m * TEXELS_PER_M), 2 * TEXELS_PER_M
     y, x = _grid(height, width)
@@ -68,24 +75,21 @@ def wall(rng: np.random.Generator, colour: Rgb, height_m: float, style: str) -> 
         mask = 0.5 + 0.5 * np.tanh(8 * np.sin(2 * np.pi * x / 0.5))
         image = image * (1 - 0.16 * mask[..., None])
     elif style == "wainscot":
-        low = up < 0.95
-        image = np.where(low[..., None], image * darker / np.asarray(colour).clip(0.05), image)
-        image = np.where((np.abs(up - 0.95) < 0.05)[..., None], lighter, image)
+        image = _paint(image, up < 0.95, image * darker / np.asarray(colour).clip(0.05))
+        image = _paint(image, np.abs(up - 0.95) < 0.05, lighter)
     elif style == "band":
-        image = np.where((up > 1.55)[..., None], lighter * (0.2 * image + 0.8), image)
-        image = np.where((np.abs(up - 1.55) < 0.06)[..., None], darker, image)
+        image = _paint(image, up > 1.55, lighter * (0.2 * image + 0.8))
+        image = _paint(image, np.abs(up - 1.55) < 0.06, darker)
     elif style == "diamonds":
         d = np.abs((x / 0.5) % 1 - 0.5) + np.abs((up / 0.65) % 1 - 0.5)
         image = image * (1 - 0.18 * (d < 0.26)[..., None])
     elif style == "bricks":
         row = np.floor(up / 0.2)
         along = x / 0.5 + 0.5 * (row % 2)
-        tone = rng.uniform(0.86, 1.1, (64, 4))[
-            row.astype(int) % 64, np.floor(along).astype(int) % 4
-        ]
-        image = image * tone[..., None]
+        tones = rng.uniform(0.86, 1.1, (64, 4))
+        image = image * tones[row.astype(int) % 64, np.floor(along).astype(int) % 4][..., None]
         mortar = ((up % 0.2) < 0.03) | ((along % 1) < 0.06)
-        image = np.where(mortar[..., None], 0.35 * image + 0.65 * lighter * 0.9, image)
+        image = _paint(image, mortar, 0.35 * image + 0.65 * lighter * 0.9)
     return _bytes(image)
 
 
@@ -137,9 +141,8 @@ def rug(rng: np.random.Generator, hue: float) -> np.ndarray:
     side = 96
     y, x = (np.mgrid[0:side, 0:side] + 0.5) / side * 2 - 1
     base = hsv(hue, rng.uniform(0.5, 0.8), rng.uniform(0.45, 0.8))
-    second = hsv(
-        hue + rng.choice([0.08, 0.33, 0.5]), rng.uniform(0.3, 0.6), rng.uniform(0.75, 0.95)
-    )
+    other_hue = hue + rng.choice([0.08, 0.33, 0.5])
+    second = hsv(other_hue, rng.uniform(0.3, 0.6), rng.uniform(0.75, 0.95))
     third = hsv(hue + 0.02, 0.7, 0.32)
     kind = rng.integers(4)
     if kind == 0:
@@ -152,15 +155,14 @@ def rug(rng: np.random.Generator, hue: float) -> np.ndarray:
         mask = np.zeros_like(x, bool)
     image = np.where(mask[..., None], second, base)
     edge = np.maximum(np.abs(x), np.abs(y))
-    image = np.where((edge > 0.78)[..., None], third, image)
-    image = np.where((edge > 0.92)[..., None], second, image)
+    image = _paint(_paint(image, edge > 0.78, third), edge > 0.92, second)
     return _bytes(image * (1 + 0.04 * _noise(rng, side, side, 12)[..., None]))
 
 
 def picture(rng: np.random.Generator) -> np.ndarray:
     """Return a framed painting: a landscape, blocks, circles, waves or a face."""
     side = 64
-    y, x = (np.mgrid[0:side, 0:side] + 0.5) / side
+    y, x = _unit(side)
     hue = rng.uniform()
     kind = rng.integers(5)
     image = np.broadcast_to(hsv(hue, 0.35, 0.9), (side, side, 3)).copy()
@@ -168,14 +170,10 @@ def picture(rng: np.random.Generator) -> np.ndarray:
         sky_high, sky_low = hsv(0.58, 0.6, 0.85), hsv(rng.uniform(0, 0.15), 0.45, 1.0)
         image = sky_high + (sky_low - sky_high) * y[..., None]
         sun_x, sun_y = rng.uniform(0.2, 0.8), rng.uniform(0.2, 0.4)
-        image = np.where(
-            ((x - sun_x) ** 2 + (y - sun_y) ** 2 < 0.012)[..., None], [1, 0.93, 0.6], image
-        )
+        image[(x - sun_x) ** 2 + (y - sun_y) ** 2 < 0.012] = [1, 0.93, 0.6]
         for k, level in enumerate((0.5, 0.64, 0.8)):
             ridge = level + 0.09 * np.sin(2 * np.pi * (x * rng.uniform(0.6, 1.6) + rng.uniform()))
-            image = np.where(
-                (y > ridge)[..., None], hsv(0.3 + 0.05 * k + 0.2 * hue, 0.5, 0.65 - 0.16 * k), image
-            )
+            image[y > ridge] = hsv(0.3 + 0.05 * k + 0.2 * hue, 0.5, 0.65 - 0.16 * k)
     elif kind == 1:
         for _ in range(5):
             x0, y0 = rng.uniform(0, 0.8, 2)
@@ -187,16 +185,14 @@ def picture(rng: np.random.Generator) -> np.ndarray:
         ring = np.floor(np.hypot(x - cx, y - cy) / 0.13).astype(int) % 4
         image = np.stack([hsv(hue + 0.13 * k, 0.7, 0.9 - 0.15 * k) for k in range(4)])[ring]
     elif kind == 3:
-        wave = (
-            np.floor((y + 0.08 * np.sin(2 * np.pi * (x * 1.5 + rng.uniform()))) * 5).astype(int) % 5
-        )
-        image = np.stack([hsv(hue + 0.09 * k, 0.6, 0.4 + 0.13 * k) for k in range(5)])[wave]
+        wave = y + 0.08 * np.sin(2 * np.pi * (x * 1.5 + rng.uniform()))
+        bands = np.stack([hsv(hue + 0.09 * k, 0.6, 0.4 + 0.13 * k) for k in range(5)])
+        image = bands[np.floor(wave * 5).astype(int) % 5]
     else:
         image[(y > 0.72) & (np.abs(x - 0.5) < 0.32)] = hsv(hue + 0.5, 0.7, 0.45)
         face = ((x - 0.5) / 0.17) ** 2 + ((y - 0.48) / 0.23) ** 2
-        image[((x - 0.5) / 0.22) ** 2 + ((y - 0.42) / 0.27) ** 2 < 1] = hsv(
-            0.07, 0.7, rng.uniform(0.15, 0.5)
-        )
+        hair = ((x - 0.5) / 0.22) ** 2 + ((y - 0.42) / 0.27) ** 2
+        image[hair < 1] = hsv(0.07, 0.7, rng.uniform(0.15, 0.5))
         image[face < 1] = hsv(0.07, rng.uniform(0.25, 0.5), rng.uniform(0.6, 0.95))
     frame = np.maximum(np.abs(x - 0.5), np.abs(y - 0.5)) > 0.44
     image[frame] = hsv(0.09, 0.55, rng.choice([0.2, 0.45, 0.75]))
@@ -206,29 +202,20 @@ def picture(rng: np.random.Generator) -> np.ndarray:
 def window_view(rng: np.random.Generator) -> np.ndarray:
     """Return the view out of a window: a bright sky over hills, behind a window cross."""
     side = 64
-    y, x = (np.mgrid[0:side, 0:side] + 0.5) / side
-    image = (
-        np.array([0.62, 0.82, 1.0])
-        + (np.array([0.95, 0.98, 1.0]) - [0.62, 0.82, 1.0]) * y[..., None]
-    )
-    cloud = 0.5 * _noise(rng, side, side, 4)
-    image = image + 0.12 * np.clip(cloud, 0, 1)[..., None]
+    y, x = _unit(side)
+    above, below = np.array([0.62, 0.82, 1.0]), np.array([0.95, 0.98, 1.0])
+    image = above + (below - above) * y[..., None]
+    image = image + 0.12 * np.clip(0.5 * _noise(rng, side, side, 4), 0, 1)[..., None]
     ridge = 0.68 + 0.07 * np.sin(2 * np.pi * (x * rng.uniform(0.7, 1.4) + rng.uniform()))
-    image = np.where((y > ridge)[..., None], hsv(rng.uniform(0.22, 0.36), 0.45, 0.68), image)
-    cross = (np.abs(x - 0.5) < 0.03) | (np.abs(y - 0.45) < 0.03)
-    return _bytes(np.where(cross[..., None], 0.97, image))
+    image = _paint(image, y > ridge, hsv(rng.uniform(0.22, 0.36), 0.45, 0.68))
+    return _bytes(_paint(image, (np.abs(x - 0.5) < 0.03) | (np.abs(y - 0.45) < 0.03), 0.97))
 
 
 def screen(rng: np.random.Generator) -> np.ndarray:
     """Return a television's picture: a dim gradient with a few bright shapes."""
-    y, x = (np.mgrid[0:32, 0:32] + 0.5) / 32
+    y, x = _unit(32)
     hue = rng.uniform()
-    image = (
-        hsv(hue, 0.7, 0.28)
-        + (hsv(hue + 0.15, 0.6, 0.55) - hsv(hue, 0.7, 0.28)) * (x + y)[..., None] / 2
-    )
-    return _bytes(
-        np.where(
-            ((x - 0.4) ** 2 + (y - 0.5) ** 2 < 0.05)[..., None], hsv(hue + 0.45, 0.4, 0.85), image
-        )
-    )
+    dim = hsv(hue, 0.7, 0.28)
+    image = dim + (hsv(hue + 0.15, 0.6, 0.55) - dim) * (x + y)[..., None] / 2
+    spot = (x - 0.4) ** 2 + (y - 0.5) ** 2 < 0.05
+    return _bytes(_paint(image, spot, hsv(hue + 0.45, 0.4, 0.85)))

@@ -13,18 +13,15 @@ from pathlib import Path
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary path that replaces ``path`` when the block ends without an error.
 
-    Several processes may do this to one path at once: each writes its own file, and the last rename
-    wins. If the block fails, the temporary file is removed and ``path`` is unchanged.
+    Several processes may do this to one path at once: each writes its own file in the same folder,
+    and the last rename wins. If the block fails, the temporary file is removed and ``path`` is
+    unchanged.
 
     Args:
         path: a file, which may already exist, or a folder, which must not.
 
-    Yields:
-        A path in the same folder, ending in ``.partial``, where nothing exists yet.
-
     Raises:
-        OSError: writing failed; the error names ``path`` if it names no other file (the error of a
-            full disk names none).
+        OSError: writing failed; it names ``path`` if it names no other file (as for a full disk).
     """
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     remove(partial)  # left by a killed process with the same id
@@ -42,6 +39,14 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file in UTF-8, atomically."""
     with replacing(path) as partial:
         partial.write_text(text, "utf-8")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file atomically, and flush it to disk."""
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def remove(path: Path) -> None:

@@ -42,13 +42,7 @@ _KINDS = "fiub"
 
 
 def read(path: Path) -> Tensors:
-    """Read nested tables of arrays from a pickle.
-
-    Args:
-        path: a pickle of NumPy arrays, or a file of ``torch.save``.
-
-    Returns:
-        Nested dictionaries; every leaf is a NumPy array.
+    """Read nested dictionaries of arrays from a pickle of NumPy arrays or a file of ``torch.save``.
 
     Raises:
         UserError: the file is missing or damaged, contains anything but tensors in tables, or has
@@ -167,10 +161,6 @@ def _tensor(storage: Any, offset: int, size: tuple, stride: tuple, *_: Any) -> n
     return np.lib.stride_tricks.as_strided(storage[offset:], size, steps, writeable=False).copy()
 
 
-def _parameter(tensor: Any, *_: Any) -> Any:
-    return tensor
-
-
 def _require_arrays(found: Any) -> Tensors:
     """Return the unpickled tables of arrays; raise an error for anything else."""
     if not isinstance(found, dict) or not all(isinstance(name, str) for name in found):
@@ -189,6 +179,6 @@ _NAMES: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy._core.multiarray", "_reconstruct"): lambda *_: _Array(),
     ("collections", "OrderedDict"): lambda *_: _Table(),
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-    ("torch._utils", "_rebuild_parameter"): _parameter,
+    ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
 }
 """All names that a pickle may use, and their stand-ins."""

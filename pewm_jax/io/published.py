@@ -101,15 +101,7 @@ class Network:
         return jax.eval_shape(lambda key: self.init(config, key), jax.random.key(0))
 
     def config(self, values: dict[str, Any], where: str) -> Any:
-        """Read the published settings.
-
-        Args:
-            values: the JSON object.
-            where: the file, for error messages.
-
-        Raises:
-            UserError: a setting is unknown or unsupported.
-        """
+        """Read the published settings; UserError, which names ``where``, for unsupported ones."""
         try:
             return self.read_config(values)
         except UserError as error:
@@ -124,15 +116,9 @@ def rename(path: str, rules: Sequence[tuple[str, Any]]) -> str:
 
 
 def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
-    """Raise an error if settings name another class.
+    """Raise UserError if settings name another class than ``name``; they may name none.
 
-    Args:
-        values: the JSON object.
-        what: what they describe, for the message: ``The U-Net``.
-        name: the supported class.
-
-    Raises:
-        UserError: they name another class. Naming none is allowed.
+    Here and below ``values`` is the JSON object and ``what`` names it in messages: ``The U-Net``.
     """
     kind = values.get("_class_name", name)
     if kind != name:
@@ -140,10 +126,9 @@ def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
 
 
 def require_known(values: Mapping[str, Any], what: str, known: Collection[str]) -> None:
-    """Raise an error for unknown settings; those that begin with ``_`` are metadata and ignored.
+    """Raise UserError for unknown settings.
 
-    Raises:
-        UserError: some settings are unknown; lists them.
+    Those that begin with ``_`` are metadata and ignored.
     """
     unknown = sorted(key for key in values if not key.startswith("_") and key not in known)
     if unknown:
@@ -178,24 +163,17 @@ def read_settings(
 
 
 def require_only(given: Mapping[str, Any], what: str, only: Mapping[str, Any]) -> None:
-    """Raise an error for settings with another value than the only supported one.
-
-    Raises:
-        UserError: a setting has another value.
-    """
+    """Raise UserError for settings with another value than the only supported one."""
     for key, value in only.items():
         if _plain(given.get(key, value)) != _plain(value):
             raise UserError(f"{what}'s {key} is {given[key]!r}; only {value!r} is supported.")
 
 
 def require_kinds(given: Mapping[str, Any], what: str, examples: Mapping[str, Any]) -> None:
-    """Raise an error for settings whose types differ from those of examples.
+    """Raise UserError for settings whose types differ from those of examples.
 
     An integer is accepted for a float. A list must have the length of a tuple in the examples; for
     a list in the examples it may have any length.
-
-    Raises:
-        UserError: a setting has another type.
     """
     for key, example in examples.items():
         if not _same_type(given[key], example):

@@ -30,10 +30,7 @@ PAD = 1 << 28
 def keep_small() -> bool:
     """Limit this process to ``ARENAS`` malloc arenas, and return freed blocks from ``LARGE`` bytes.
 
-    For servers that run for days.
-
-    Returns:
-        Whether the settings were accepted.
+    For servers that run for days. Returns whether the settings were accepted.
     """
     return _set({ARENA_MAX: ARENAS, MMAP_THRESHOLD: LARGE})
 
@@ -42,10 +39,8 @@ def keep_large() -> bool:
     """Keep freed memory in the process, including large blocks, and reuse it.
 
     For training on CPUs. By default each large array is mapped again at every step, and the system
-    zeroes its pages one by one (``benchmarks/heap.py`` measures the cost).
-
-    Returns:
-        Whether the settings were accepted.
+    zeroes its pages one by one (``benchmarks/heap.py`` measures the cost). Returns whether the
+    settings were accepted.
     """
     return _set({ARENA_MAX: 1, MMAP_MAX: 0, TRIM_THRESHOLD: NEVER, TOP_PAD: PAD})
 
@@ -66,7 +61,7 @@ def cache_compilation(folder: str | Path) -> None:
     (``JAX_COMPILATION_CACHE_DIR`` or ``jax.config``) is kept, and so is a cache that the caller has
     disabled (``JAX_ENABLE_COMPILATION_CACHE``).
     """
-    import jax  # noqa: PLC0415 - noqa: PLC0415 - takes seconds, and error paths do not need it
+    import jax  # noqa: PLC0415 - takes seconds, and error paths do not need it
 
     chosen: Any = jax.config
     if chosen.jax_compilation_cache_dir or not chosen.jax_enable_compilation_cache:

@@ -7,10 +7,12 @@ demand, so at most one of them is in memory.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,133 +21,90 @@ from pewm_jax.io import tensor_files, tree
 from pewm_jax.types import Array
 
 
-class Source(Protocol):
-    """Named tensors that are read one by one."""
+@dataclasses.dataclass(frozen=True)
+class Tensor:
+    """A tensor of known shape and dtype; ``read`` reads its values."""
 
-    @property
-    def where(self) -> str:
-        """Return the file or folder, for error messages."""
-        ...
-
-    def names(self) -> Iterable[str]:
-        """Return the names of all tensors."""
-        ...
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of a tensor without reading it."""
-        ...
-
-    def dtype(self, name: str) -> np.dtype:
-        """Return the dtype of a tensor without reading it."""
-        ...
-
-    def read(self, name: str) -> Array:
-        """Read a tensor."""
-        ...
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    read: Callable[[], Array]
 
 
 @dataclasses.dataclass(frozen=True)
-class Arrays:
-    """Tensors in memory, as a ``Source``."""
+class Source:
+    """Named tensors that are read one by one.
 
-    tensors: Mapping[str, Array]
+    Attributes:
+        where: the file or folder, for error messages.
+        tensors: the tensors by name.
+    """
+
     where: str
+    tensors: Mapping[str, Tensor]
 
     def names(self) -> Iterable[str]:
         """Return the names of all tensors."""
         return self.tensors.keys()
 
     def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of a tensor."""
-        return tuple(self.tensors[name].shape)
-
-    def dtype(self, name: str) -> np.dtype:
-        """Return the dtype of a tensor."""
-        return np.dtype(self.tensors[name].dtype)
-
-    def read(self, name: str) -> Array:
-        """Return a tensor."""
-        return self.tensors[name]
-
-
-@dataclasses.dataclass(frozen=True)
-class Files:
-    """Tensors in safetensors files, as a ``Source``."""
-
-    where: str
-    places: Mapping[str, tuple[Path, tensor_files.Place]]
-
-    def names(self) -> Iterable[str]:
-        """Return the names of all tensors."""
-        return self.places.keys()
-
-    def shape(self, name: str) -> tuple[int, ...]:
         """Return the shape of a tensor without reading it."""
-        return self.places[name][1].shape
+        return self.tensors[name].shape
 
     def dtype(self, name: str) -> np.dtype:
         """Return the dtype of a tensor without reading it."""
-        return self.places[name][1].dtype
+        return self.tensors[name].dtype
 
     def read(self, name: str) -> Array:
-        """Read a tensor.
-
-        Raises:
-            UserError: the file ends before the tensor does.
-        """
-        path, place = self.places[name]
-        return tensor_files.read_at(path, place)
+        """Read a tensor; raises UserError if its file is damaged."""
+        return self.tensors[name].read()
 
 
-@dataclasses.dataclass(frozen=True)
-class Renamed:
-    """A view of another source with renamed tensors, or with equal parts of their first axis.
+def in_memory(tensors: Mapping[str, Array], where: str) -> Source:
+    """Return tensors in memory as a ``Source``."""
+    return Source(
+        where,
+        {n: Tensor(tuple(x.shape), np.dtype(x.dtype), lambda x=x: x) for n, x in tensors.items()},
+    )
 
-    Attributes:
-        inner: the other source.
-        views: name → (name in ``inner``, index of the part, number of parts).
+
+def renamed(inner: Source, views: Mapping[str, tuple[str, int, int]]) -> Source:
+    """Return a view of a source with renamed tensors, or with equal parts of their first axis.
+
+    Args:
+        inner: the source.
+        views: new name → (name in ``inner``, index of the part, number of parts).
     """
 
-    inner: Source
-    views: Mapping[str, tuple[str, int, int]]
+    def view(name: str, part: int, of: int) -> Tensor:
+        whole = inner.tensors[name]
+        if of == 1:
+            return whole
+        rows = whole.shape[0] // of
+        return dataclasses.replace(
+            whole,
+            shape=(rows, *whole.shape[1:]),
+            read=lambda: whole.read()[part * rows : (part + 1) * rows],
+        )
 
-    @property
-    def where(self) -> str:
-        """Return the file or folder, for error messages."""
-        return self.inner.where
-
-    def names(self) -> Iterable[str]:
-        """Return the names of all tensors."""
-        return self.views.keys()
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of a tensor without reading it."""
-        inner, _, of = self.views[name]
-        whole = self.inner.shape(inner)
-        return whole if of == 1 else (whole[0] // of, *whole[1:])
-
-    def dtype(self, name: str) -> np.dtype:
-        """Return the dtype of a tensor without reading it."""
-        return self.inner.dtype(self.views[name][0])
-
-    def read(self, name: str) -> Array:
-        """Read a tensor."""
-        inner, part, of = self.views[name]
-        whole = self.inner.read(inner)
-        rows = len(whole) // of if of > 1 else 0
-        return whole if of == 1 else whole[part * rows : (part + 1) * rows]
+    return Source(inner.where, {new: view(*old) for new, old in views.items()})
 
 
-def open_folder(folder: Path) -> Files:
-    """Open the weights of one network in the layout of diffusers and transformers.
+def open_file(path: Path) -> Source:
+    """Open one safetensors file; raises UserError if it is missing, truncated or damaged."""
+    found = {}
+    for name, place in tensor_files.places(path).items():
+        read = functools.partial(tensor_files.read_at, path, place)
+        found[name] = Tensor(place.shape, place.dtype, read)
+    return Source(str(path), found)
+
+
+def open_folder(folder: Path) -> Source:
+    """Open the weights of one network in the layout of diffusers and transformers; read headers.
 
     Args:
         folder: contains ``*.safetensors.index.json`` and the shards it names, or one
             ``*.safetensors``. If there are several precisions (``model.fp16.safetensors``), the
             file without a precision in its name is used.
-
-    Returns:
-        The tensors, not read yet.
 
     Raises:
         UserError: no weights, an index that names missing files or tensors, shards without their
@@ -160,8 +119,12 @@ def open_folder(folder: Path) -> Files:
     if not candidates:
         raise _without_weights(folder, files)
     chosen = candidates[0]
-    source = _open_shards(folder, chosen) if chosen in indices else open_file(chosen)
-    used = {path for path, _ in source.places.values()}
+    if chosen in whole:
+        used, source = {chosen}, open_file(chosen)
+    else:
+        shards = _read_index(folder, chosen)
+        opened = [_open_shard(path, wanted).tensors.items() for path, wanted in shards.items()]
+        used, source = set(shards), Source(str(folder), dict(itertools.chain(*opened)))
     beside = [p.name for p in files if p not in used and _precision(p) == _precision(chosen)]
     if beside:
         raise UserError(
@@ -186,44 +149,34 @@ def _without_weights(folder: Path, shards: Sequence[Path]) -> UserError:
     )
 
 
-def open_file(path: Path) -> Files:
-    """Open one safetensors file.
-
-    Raises:
-        UserError: the file is missing, truncated or damaged.
-    """
-    return Files(str(path), {n: (path, p) for n, p in tensor_files.places(path).items()})
-
-
-def _open_shards(folder: Path, index: Path) -> Files:
+def _read_index(folder: Path, index: Path) -> dict[Path, set[str]]:
+    """Return the names of the tensors that each shard must contain."""
     table = read_json(index).get("weight_map")
     if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
         raise UserError(f"{index} has no table weight_map of tensors and files; copy it again.")
-    shards = sorted(set(table.values()))
-    absent = [name for name in shards if not (folder / name).is_file()]
+    shards: dict[Path, set[str]] = {folder / name: set() for name in sorted(set(table.values()))}
+    absent = [path.name for path in shards if not path.is_file()]
     if absent:
         raise UserError(
             f"{index} names files that do not exist: {tree.listing(absent)}; copy them to {folder}."
         )
-    places: dict[str, tuple[Path, tensor_files.Place]] = {}
-    for shard in shards:
-        inside = tensor_files.places(folder / shard)
-        wanted = {name for name, file in table.items() if file == shard}
-        if inside.keys() != wanted:
-            lacking, extra = wanted - inside.keys(), inside.keys() - wanted
-            what = f"lacks {tree.listing(lacking)}" if lacking else f"holds {tree.listing(extra)}"
-            word = "listed in the index" if lacking else "not listed in the index"
-            raise UserError(f"{folder / shard} {what}, {word}; copy the whole folder again.")
-        places |= {name: (folder / shard, place) for name, place in inside.items()}
-    return Files(str(folder), places)
+    for name, file in table.items():
+        shards[folder / file].add(name)
+    return shards
+
+
+def _open_shard(path: Path, wanted: set[str]) -> Source:
+    inside = open_file(path)
+    if inside.tensors.keys() != wanted:
+        lacking, extra = wanted - inside.tensors.keys(), inside.tensors.keys() - wanted
+        what = f"lacks {tree.listing(lacking)}" if lacking else f"holds {tree.listing(extra)}"
+        word = "listed in the index" if lacking else "not listed in the index"
+        raise UserError(f"{path} {what}, {word}; copy the whole folder again.")
+    return inside
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON table.
-
-    Raises:
-        UserError: the file is missing, unreadable, not JSON or not a table.
-    """
+    """Read a JSON table; raises UserError if the file is missing, unreadable or no JSON table."""
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -238,15 +191,9 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_config(path: Path, classes: Sequence[str], key: str = "_class_name") -> dict[str, Any]:
-    """Read the settings of a network and check its class.
+    """Read the settings in ``config.json``, ``scheduler_config.json`` or ``model_index.json``.
 
-    Args:
-        path: ``config.json``, ``scheduler_config.json`` or ``model_index.json``.
-        classes: the supported class names.
-        key: the setting that names the class.
-
-    Returns:
-        The settings in the file, including the class name.
+    The setting ``key`` names the class.
 
     Raises:
         UserError: the file cannot be read or names another class.

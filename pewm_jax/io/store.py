@@ -16,6 +16,7 @@ one another.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import io
 import json
@@ -53,33 +54,20 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 
-class _NotWholeError(ValueError):
-    """A file contains no result."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """How a result is stored.
-
-    Attributes:
-        suffix: the file's suffix.
-        write: writes a result to a path.
-        read: reads it; raises one of ``DAMAGED`` if the file is damaged.
-    """
+    """How a result is stored; ``read`` raises one of ``DAMAGED`` for a damaged file."""
 
     suffix: str
     write: Callable[[Path, Any], None]
     read: Callable[[Path], Any]
 
 
-def _write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+def _write_arrays(
+    path: Path, arrays: Mapping[str, np.ndarray], save: Callable[..., None] = np.savez
+) -> None:
     with path.open("wb") as file:
-        np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-
-
-def _write_compressed(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)  # pyright: ignore[reportArgumentType]
+        save(file, **arrays)
 
 
 def _read_arrays(path: Path) -> Arrays:
@@ -87,7 +75,7 @@ def _read_arrays(path: Path) -> Arrays:
     # OSError on a file, like an error of the disk.
     found = np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)
     if isinstance(found, np.ndarray):
-        raise _NotWholeError("it contains one unnamed array")
+        raise ValueError("it contains one unnamed array")  # noqa: TRY004 - one of ``DAMAGED``
     with found as arrays:
         return {key: arrays[key] for key in arrays.files}
 
@@ -99,24 +87,22 @@ def _write_table(path: Path, table: Mapping[str, Any]) -> None:
 def _read_table(path: Path) -> dict[str, Any]:
     found = json.loads(path.read_text("utf-8"))
     if not isinstance(found, dict):
-        raise _NotWholeError("it contains no table")
+        raise ValueError("it contains no table")  # noqa: TRY004 - one of ``DAMAGED``
     return found
 
 
 ARRAYS = Format(".npz", _write_arrays, _read_arrays)
 """Named NumPy arrays."""
-COMPRESSED = Format(".npz", _write_compressed, _read_arrays)
+COMPRESSED = Format(
+    ".npz", functools.partial(_write_arrays, save=np.savez_compressed), _read_arrays
+)
 """Named NumPy arrays, compressed, for files in a repository."""
 TABLE = Format(".json", _write_table, _read_table)
 """A table of plain values."""
 
 
 def inputs_hash(inputs: Any) -> str:
-    """Return a hash of what a result depends on.
-
-    Args:
-        inputs: JSON-serializable values. The order of keys does not matter.
-    """
+    """Return a hash of JSON-serializable values, regardless of the order of keys."""
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
 
 
@@ -204,13 +190,7 @@ class ResultCache:
 
 @dataclasses.dataclass(frozen=True)
 class Workers:
-    """The processes that share the work of a loop; by default only this one.
-
-    Attributes:
-        count: number of processes.
-        index: number of this process.
-        barrier: waits until all processes have called it with this name.
-    """
+    """The processes that share the work of a loop; ``barrier`` waits until all have called it."""
 
     count: int = 1
     index: int = 0
@@ -221,12 +201,8 @@ class Workers:
     ) -> list[K]:
         """Return this process's pieces: every P-th heavy one and every P-th light one.
 
-        The assignment depends only on a piece's position in the list, so all processes agree on it
-        without communication, even when the job is resumed.
-
-        Args:
-            keys: all pieces, in the same order in all processes.
-            is_light: whether a piece is cheap compared with the others.
+        The assignment depends only on a piece's position in the list, which is the same in all
+        processes, so they agree on it without communication, even when the job is resumed.
         """
         light = {key: bool(is_light and is_light(key)) for key in keys}
         chosen: set[K] = set()
@@ -308,10 +284,7 @@ def map_resumable(
 
 
 def require_same_inputs(
-    folder: Path,
-    inputs: Mapping[str, Any],
-    what: str,
-    ignored: Collection[str] = (),
+    folder: Path, inputs: Mapping[str, Any], what: str, ignored: Collection[str] = ()
 ) -> None:
     """Raise an error if a folder's results have other inputs; otherwise write the inputs there.
 
@@ -324,13 +297,12 @@ def require_same_inputs(
     Raises:
         UserError: some inputs differ; names them.
     """
-    cache = ResultCache(folder, TABLE)
     file = folder / SETTINGS
     now = json.dumps({n: value for n, value in inputs.items() if n not in ignored}, indent=1)
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file: choose a folder with --out.")
     if file.exists():
-        before = cache.get(file.stem)
+        before = ResultCache(folder, TABLE).get(file.stem)
         if before is None:
             raise UserError(f"{file} is damaged: delete it if the settings have not changed.")
         wrong = [name for name, value in json.loads(now).items() if before.get(name) != value]
@@ -344,13 +316,7 @@ def require_same_inputs(
 
 
 def make_once(mark: Path, inputs: Any, make: Callable[[], None]) -> None:
-    """Call a function, unless a marker file records a call with the same inputs.
-
-    Args:
-        mark: a JSON file, written after the function returns.
-        inputs: what the result depends on, as plain values.
-        make: writes files.
-    """
+    """Call a function, unless the JSON file ``mark`` records a call with the same plain inputs."""
     try:
         before = json.loads(mark.read_text("utf-8"))
     except (FileNotFoundError, ValueError):

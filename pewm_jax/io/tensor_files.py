@@ -3,12 +3,10 @@
 The ``safetensors`` library reads files and checks that header and size agree. This module adds
 three functions that the library (0.8) lacks:
 
-- Writing tensor by tensor. ``serialize_file`` needs all tensors in host memory at once; here at
-  most one is held in addition to those of the caller.
+- Writing tensor by tensor: ``serialize_file`` needs all tensors in host memory at once.
 - Checksums. The header of our files contains the SHA-256 of every tensor and of the header itself.
 - Memory-mapping a file, so that only the indexed part of an array is read. The result of
-  ``get_slice`` is not an array: it has neither ``shape`` nor ``dtype``, and cannot be indexed by a
-  list.
+  ``get_slice`` has neither ``shape`` nor ``dtype``, and cannot be indexed by a list.
 """
 
 from __future__ import annotations
@@ -39,20 +37,10 @@ files."""
 _TENSORS, _HEADER = "sha256", "header_sha256"
 """The keys of checksums: of each tensor, and of the header with zeros in place of this one."""
 _NO_DIGEST = "0" * 64
-_DTYPES = {
-    "BOOL": np.dtype(bool),
-    "U8": np.dtype(np.uint8),
-    "I8": np.dtype(np.int8),
-    "I16": np.dtype(np.int16),
-    "U16": np.dtype(np.uint16),
-    "I32": np.dtype(np.int32),
-    "U32": np.dtype(np.uint32),
-    "I64": np.dtype(np.int64),
-    "U64": np.dtype(np.uint64),
-    "F16": np.dtype(np.float16),
-    "BF16": np.dtype(jnp.bfloat16),
-    "F32": np.dtype(np.float32),
-    "F64": np.dtype(np.float64),
+_DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(jnp.bfloat16)} | {
+    f"{letter}{8 * size}": np.dtype(f"{letter.lower()}{size}")
+    for letter, sizes in (("U", (1, 2, 4, 8)), ("I", (1, 2, 4, 8)), ("F", (2, 4, 8)))
+    for size in sizes
 }
 _NAMES = {dtype: name for name, dtype in _DTYPES.items()}
 
@@ -62,9 +50,6 @@ class Place:
     """Location of one tensor in a safetensors file.
 
     Attributes:
-        name: its name.
-        shape: its shape.
-        dtype: its dtype.
         begin: offset of its first byte in the file.
         sha256: hash of its bytes, empty if the file has none.
     """
@@ -106,7 +91,8 @@ def write(
     Raises:
         ValueError: the tensors differ from ``like``.
     """
-    order = sorted(like, key=lambda name: (-like[name].dtype.itemsize, name))
+    specs = {name: (tuple(x.shape), np.dtype(x.dtype)) for name, x in like.items()}
+    order = sorted(specs, key=lambda name: (-specs[name][1].itemsize, name))
     facts, ours = dict(metadata), OURS in metadata
     table: dict[str, Any] = {"__metadata__": facts}
     digests = dict.fromkeys(order, _NO_DIGEST)
@@ -114,13 +100,9 @@ def write(
         facts |= {_TENSORS: json.dumps(digests), _HEADER: _NO_DIGEST}
     end = 0
     for name in order:
-        dtype = np.dtype(like[name].dtype)
-        begin, end = end, end + math.prod(like[name].shape) * dtype.itemsize
-        table[name] = {
-            "dtype": _NAMES[dtype],
-            "shape": list(like[name].shape),
-            "data_offsets": [begin, end],
-        }
+        shape, dtype = specs[name]
+        begin, end = end, end + math.prod(shape) * dtype.itemsize
+        table[name] = {"dtype": _NAMES[dtype], "shape": list(shape), "data_offsets": [begin, end]}
     text = _text(table)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(path) as partial, partial.open("wb") as file:
@@ -128,10 +110,7 @@ def write(
         start, left = file.tell(), set(order)
         for name, tensor in tensors:
             array = np.asarray(jax.device_get(tensor))
-            if name not in left or (array.shape, array.dtype) != (
-                tuple(like[name].shape),
-                np.dtype(like[name].dtype),
-            ):
+            if name not in left or (array.shape, array.dtype) != specs[name]:
                 raise ValueError(f"{name} {array.shape} {array.dtype} differs from ``like``.")
             left.remove(name)
             file.seek(start + table[name]["data_offsets"][0])
@@ -157,7 +136,7 @@ def _text(table: Mapping[str, object]) -> bytes:
     return text + b" " * (-len(text) % 8)
 
 
-def size(like: Mapping[str, Array | jax.ShapeDtypeStruct]) -> int:
+def size(like: Mapping[str, Any]) -> int:
     """Return the size in bytes of tensors, given anything with shape and dtype by name."""
     return sum(math.prod(x.shape) * np.dtype(x.dtype).itemsize for x in like.values())
 
@@ -188,9 +167,6 @@ def read(
         path: a safetensors file.
         wanted: returns, by name, whether to read a tensor; all by default.
 
-    Yields:
-        Names and arrays.
-
     Raises:
         UserError: the file is missing or damaged, or a checksum is wrong.
     """
@@ -201,11 +177,7 @@ def read(
 
 
 def mapped(path: Path) -> dict[str, np.ndarray]:
-    """Memory-map a file: only indexed parts are read, and checksums are not verified.
-
-    Raises:
-        UserError: as ``places``.
-    """
+    """Memory-map a file: only indexed parts are read, and checksums are not verified."""
     found = places(path)
     whole = np.memmap(path, np.uint8, "r")
     return {
@@ -215,11 +187,7 @@ def mapped(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_at(path: Path, place: Place) -> np.ndarray:
-    """Read one tensor into its own memory.
-
-    Raises:
-        UserError: the file is missing or damaged, or a checksum is wrong.
-    """
+    """Read one tensor into its own memory; raises as ``read``."""
     with _open(path) as file:
         return _read(path, file, place)
 
@@ -242,7 +210,9 @@ def _open(path: Path) -> Iterator[Any]:
 
 def _places(path: Path, file: Any) -> dict[str, Place]:
     """Return the locations in an opened file; the library has checked that there are no gaps."""
-    begin, text = _header(path)
+    with path.open("rb") as raw:
+        (length,) = struct.unpack("<Q", raw.read(8))
+        begin, text = 8 + length, raw.read(length)
     facts = file.metadata() or {}
     digests = json.loads(facts[_TENSORS]) if _has_checksums(path, facts, text) else {}
     found = {}
@@ -258,13 +228,6 @@ def _places(path: Path, file: Any) -> dict[str, Place]:
         found[name] = place
         begin += place.size
     return found
-
-
-def _header(path: Path) -> tuple[int, bytes]:
-    """Return the offset at which the tensors begin, and the header's bytes."""
-    with path.open("rb") as file:
-        (length,) = struct.unpack("<Q", file.read(8))
-        return 8 + length, file.read(length)
 
 
 def _has_checksums(path: Path, facts: Mapping[str, str], text: bytes) -> bool:

@@ -34,11 +34,7 @@ def flatten(tree: Any) -> dict[str, Any]:
 
 
 def unflatten(leaves: Mapping[str, Any]) -> Params:
-    """Convert ``{path: leaf}`` to nested dictionaries; the inverse of ``flatten``.
-
-    Raises:
-        TreeError: a path is both a leaf and a branch.
-    """
+    """Convert ``{path: leaf}`` to nested dictionaries; TreeError if a leaf has leaves."""
     tree: Params = {}
     for path, leaf in leaves.items():
         *branch, name = path.split("/")
@@ -54,22 +50,14 @@ def unflatten(leaves: Mapping[str, Any]) -> Params:
 
 
 def assign(rules: Sequence[tuple[str, T]], tree: Any, what: str = "rules") -> Any:
-    """Replace every leaf by the value of the first rule whose pattern matches its path.
+    """Replace every leaf of a pytree by the value of the first rule whose pattern matches its path.
 
     Example::
 
         assign(((r".*/kernel", True), (r".*/bias", False)), params)  # a weight-decay mask
 
-    Args:
-        rules: (pattern, value) pairs; the first match wins.
-        tree: any pytree.
-        what: name of the rules in the error message.
-
-    Returns:
-        A tree of the same structure with values in place of leaves.
-
     Raises:
-        TreeError: no rule matches some leaves.
+        TreeError: no rule matches some leaves; the message names the rules by ``what``.
     """
     compiled = [(re.compile(pattern), value) for pattern, value in rules]
     unmatched: list[str] = []
@@ -119,11 +107,7 @@ def exclude(tree: Params, patterns: Sequence[str]) -> Params:
 
 
 def merge(*trees: Params) -> Params:
-    """Join nested dictionaries that have no leaf in common; the inverse of ``split``.
-
-    Raises:
-        TreeError: a leaf occurs in more than one tree.
-    """
+    """Join nested dictionaries; TreeError if they share a leaf. The inverse of ``split``."""
     leaves: dict[str, Any] = {}
     for tree in trees:
         more = flatten(tree)
@@ -147,10 +131,9 @@ def mismatches(tree: Any, like: Any) -> list[str]:
 
 
 def require_like(tree: Any, like: Any, what: str) -> None:
-    """Raise an error if two trees differ in paths or shapes.
+    """Raise TreeError if two trees differ in paths or shapes.
 
-    Raises:
-        TreeError: they differ; the message names ``what`` and lists the differences.
+    It names ``what`` and the differences.
     """
     wrong = mismatches(tree, like)
     if wrong:

@@ -13,8 +13,7 @@ import jax
 import numpy as np
 
 from pewm_jax.errors import UserError
-from pewm_jax.io import pickles as pickled_tensors
-from pewm_jax.io import tensor_files, tree
+from pewm_jax.io import pickles, tensor_files, tree
 from pewm_jax.types import Array, Params
 
 
@@ -24,12 +23,12 @@ def save(
     metadata: Mapping[str, str] | None = None,
     progress: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Write parameters to ``path``, atomically.
+    """Write nested dictionaries of arrays, on any device, to a file, atomically.
 
     Args:
-        path: the file, usually ``weights.safetensors``; its folder is created.
-        params: nested dictionaries of arrays, on any device.
-        metadata: metadata, stored in the file's header.
+        path: usually ``weights.safetensors``; its folder is created.
+        params: the parameters.
+        metadata: stored in the file's header.
         progress: called after every leaf with the bytes just written.
     """
     leaves = tree.flatten(params)
@@ -38,14 +37,11 @@ def save(
 
 
 def load(path: Path, part: str = "") -> Params:
-    """Read parameters written by ``save``.
+    """Read parameters written by ``save`` as nested dictionaries of NumPy arrays.
 
     Args:
         path: a safetensors file.
         part: read only this branch of the tree, such as ``backbone``; by default the whole tree.
-
-    Returns:
-        Nested dictionaries of NumPy arrays.
 
     Raises:
         UserError: the file is missing or damaged, or has no such branch.
@@ -69,53 +65,32 @@ def lazy(path: Path) -> Params:
 
 
 def read_others(path: Path, of: str) -> dict[str, np.ndarray]:
-    """Read the tensors of another library's file, by their names.
-
-    Args:
-        path: a safetensors file, or a pickle of tensors (``pickles.read``).
-        of: the owner of the weights, for the error message.
+    """Read the tensors of another library's file, safetensors or a pickle, by their names.
 
     Raises:
-        UserError: the file is missing or damaged.
+        UserError: the file is missing or damaged; ``of`` is the owner of the weights in the
+            message.
     """
     if not path.is_file():
         what = "is a folder" if path.is_dir() else "does not exist"
         raise UserError(f"{path} {what}; give the path of a file with the weights of {of}.")
     if path.suffix == ".safetensors":
         return dict(tensor_files.read(path))
-    return dict(tree.flatten(pickled_tensors.read(path)))
+    return dict(tree.flatten(pickles.read(path)))
 
 
 def verify(path: Path) -> None:
-    """Read a whole file, tensor by tensor, and verify its checksums.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """Read a whole file, tensor by tensor, and verify its checksums; raises as ``load``."""
     for _ in tensor_files.read(path):
         pass
 
 
-def check(params: Params, like: Params, where: str) -> None:
-    """Raise an error if parameters do not have the expected paths and shapes.
-
-    Args:
-        params: the loaded parameters.
-        like: arrays, or abstract arrays (``jax.eval_shape``), with the expected paths and shapes.
-        where: the file, for the message.
-
-    Raises:
-        TreeError: they differ; lists the differences.
-    """
-    tree.require_like(params, like, where)
+check = tree.require_like
+"""Raise TreeError if parameters do not have the paths and shapes of a tree."""
 
 
 def metadata(path: Path) -> dict[str, str]:
-    """Read only the metadata in the header.
-
-    Raises:
-        UserError: the file is missing or damaged.
-    """
+    """Read only the metadata in the header; raises as ``load``."""
     return json.loads(tensor_files.metadata(path).get(tensor_files.OURS, "{}"))
 
 

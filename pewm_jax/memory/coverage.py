@@ -14,8 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import AssembledModel, Memory
-from pewm_jax.geometry.cameras import unproject
-from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.geometry.cameras import fold_frames, unproject
 from pewm_jax.memory import cells, rendering
 from pewm_jax.memory import interface as memories
 from pewm_jax.readers.attention import AttentionConfig

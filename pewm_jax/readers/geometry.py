@@ -21,8 +21,7 @@ import numpy as np
 
 from pewm_jax.config import AssembledModel
 from pewm_jax.geometry import zbuffer
-from pewm_jax.geometry.cameras import invert_rigid, project, transform_points
-from pewm_jax.geometry.plucker import fold_frames
+from pewm_jax.geometry.cameras import fold_frames, invert_rigid, project, transform_points
 from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Params
 

@@ -17,10 +17,10 @@ import jax
 import numpy as np
 
 from pewm_jax.config import ActionConfig, Config
-from pewm_jax.data import resume
-from pewm_jax.data.dataset import EpisodeSource, describe_shard, write_shard
+from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.navigation import line_is_free
+from pewm_jax.data.resume import SplitProgress
 from pewm_jax.errors import require
 from pewm_jax.eval.loaded_run import LoadedRun
 from pewm_jax.geometry.actions import FORWARD, discrete_table
@@ -214,11 +214,11 @@ def _collect(
 ) -> None:
     """Write the walks of a practice as a dataset, unless they exist."""
     settings = {"made_by": "practice", "seed": seed, **dataclasses.asdict(study.practice)}
-    state = resume.examine(folder, settings)
-    if state == "complete":
-        return
     path = folder / "shard-00000-of-00001.array_record"
-    done = resume.prepare(folder, settings, state, {path: study.practice.walks})
+    split = SplitProgress(folder, settings, {path: range(study.practice.walks)})
+    if split.state == "complete":
+        return
+    split.prepare()
     table = discrete_table(begun.motion)
 
     def records() -> Iterator[bytes]:
@@ -226,10 +226,9 @@ def _collect(
         for number, walk in enumerate(walks):
             yield _record(walk, table, f"{home.house}-{number:04d}", home.house)
 
-    if path.name not in done:
-        write_shard(path, records())
-    shard = done.get(path.name) or describe_shard(path)
-    resume.publish(folder, settings, [shard], resume.frames_of(folder, shard))
+    if split.missing():
+        split.write(path, records())
+    split.publish()
 
 
 def _record(walk: PracticeWalk, table_A3: np.ndarray, name: str, house: str) -> bytes:

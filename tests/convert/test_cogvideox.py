@@ -207,7 +207,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
     source = {k: v.numpy() for k, v in pipelines.dit(variant).state_dict().items()}
     old = network.config(dict(pipelines.dit(variant).config), variant)
     params = pipeline.read_tensors(
-        network.entries(old), sources.Arrays(source, variant), network.like(old), "float32"
+        network.entries(old), sources.in_memory(source, variant), network.like(old), "float32"
     )
     vae = cogvideox.VAE.config(dict(pipelines.vae().config), "vae")
     config = cogvideox_world.config_of(

@@ -14,7 +14,7 @@ from pewm_jax.data.checks import check_episode
 from pewm_jax.data.episodes import read_episode, write_episode
 from pewm_jax.geometry.actions import compose, integrate
 from pewm_jax.worlds.pewm.world import PEWM
-from tests.data.two_rooms import arrays, split, write_split
+from tests.data.two_rooms import arrays, clip_at, split, write_split
 
 T = 5
 
@@ -41,7 +41,7 @@ def test_following_the_actions_of_a_clip_from_its_first_pose_gives_its_other_pos
     walk = episode(continuous=continuous, turn_around=1.0, seed=3)
     off = []
     for start in range(0, 30 - (T - 1) * stride, 4):
-        clip = clips.clip_at(config(), walk, start, stride)
+        clip = clip_at(config(), walk, start, stride)
         poses = clip.frames.camera.world_from_camera
         assert clip.actions_TA.shape == (T - 1, 3)
         assert clip.actions_TA.dtype == np.float32
@@ -53,7 +53,7 @@ def test_following_the_actions_of_a_clip_from_its_first_pose_gives_its_other_pos
 
 def test_single_actions_arrive_as_they_were_recorded():
     walk = episode(continuous=True)
-    clip = clips.clip_at(config(), walk, 6)
+    clip = clip_at(config(), walk, 6)
     np.testing.assert_array_equal(clip.actions_TA, walk.actions[6:10])
 
 
@@ -73,27 +73,27 @@ def test_actions_of_another_kind_are_kept_and_laid_end_to_end():
     walk = episode(actions=other)
     np.testing.assert_array_equal(walk.actions, other)
     assert check_episode(walk, "here") == []
-    clip = clips.clip_at(config(), walk, 2, stride=3)
+    clip = clip_at(config(), walk, 2, stride=3)
     assert clip.actions_TA.shape == (T - 1, 12)
     np.testing.assert_array_equal(clip.actions_TA.ravel(), other[2:14].ravel())
     with pytest.raises(
         UserError, match=r"actions_TA of different shapes \(\(4, 12\) and \(4, 4\)\)"
     ):
-        clips.stack([clip, clips.clip_at(config(), walk, 2)])
+        clips.stack([clip, clip_at(config(), walk, 2)])
 
 
 def test_one_frame_has_no_action():
-    assert clips.clip_at(config(), episode(), 3, frames=1).actions_TA.shape == (0, 3)
+    assert clip_at(config(), episode(), 3, frames=1).actions_TA.shape == (0, 3)
 
 
 def test_what_was_not_recorded_leaves_no_trace():
     walk = dataclasses.replace(episode(), actions=None)
-    clip = clips.clip_at(config(), walk, 3)
+    clip = clip_at(config(), walk, 3)
     assert (clip.actions_TA, clip.extras) == (None, {})
     batch = clips.stack([clip, clip])
     assert len(jax.tree.leaves(batch)) == 9
     with pytest.raises(UserError, match=r"one batch have actions_TA .*\(4, 3\) and none"):
-        clips.stack([clip, clips.clip_at(config(), episode(), 3)])
+        clips.stack([clip, clip_at(config(), episode(), 3)])
 
 
 def test_the_loader_keeps_what_is_recorded(tmp_path):

@@ -19,7 +19,7 @@ import pytest
 import trimesh
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data import engines
+from pewm_jax.data import collect as engines
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource, write_shard
@@ -192,7 +192,7 @@ def test_workers_ignore_ctrl_c_from_their_start(monkeypatch):
     class Job:
         run = functools.partial(signal.getsignal, signal.SIGINT)
 
-    monkeypatch.setattr("pewm_jax.data.engines._start_worker", os.getpid)  # it comes too late
+    monkeypatch.setattr("pewm_jax.data.collect._start_worker", os.getpid)  # it comes too late
     before = signal.getsignal(signal.SIGINT)
     heard = [handler for _, handler in engines.on_processes([Job(), Job()], workers=2)]
     assert heard == [signal.SIG_IGN] * 2

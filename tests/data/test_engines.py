@@ -15,10 +15,9 @@ import pytest
 
 from pewm_jax.cli import main as program
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data import engines
-from pewm_jax.data.collect import collect
+from pewm_jax.data import collect as engines
+from pewm_jax.data.collect import Job, collect
 from pewm_jax.data.dataset import EpisodeSource
-from pewm_jax.data.engines import Job
 from pewm_jax.data.make_episode import CollectConfig
 
 ROOT = Path(__file__).parents[2]

@@ -213,7 +213,7 @@ def test_an_import_that_was_killed_can_be_repeated(tmp_path, walk, monkeypatch, 
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("pewm_jax.data.importer.write_manifest", killed)
+        patch.setattr("pewm_jax.data.dataset.write_manifest", killed)
         with pytest.raises(KeyboardInterrupt):
             import_recording(again, lambda _: None)
     if overwrite:  # as it is where the new shard has another size than the old one

@@ -21,7 +21,7 @@ from pewm_jax.data.moving import (
 from pewm_jax.data.navigation import is_free
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import house
-from pewm_jax.data.voxel_pictures import grid_from_camera
+from pewm_jax.data.show import grid_from_camera
 from pewm_jax.data.voxelise import record_voxels
 from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw

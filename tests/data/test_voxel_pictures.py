@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import ConfigError
-from pewm_jax.data import voxel_pictures
+from pewm_jax.data import render
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.loader import require_same_cells
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
-from pewm_jax.data.voxel_pictures import grid_from_camera
+from pewm_jax.data.show import grid_from_camera
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig
-from pewm_jax.geometry import block_light
+from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
 from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.types import Camera
@@ -39,12 +39,12 @@ def room():
 
 def test_a_room_of_blocks_is_lit_by_side_distance_and_corner():
     voxels, camera = room()
-    seen = voxel_pictures.draw_blocks(voxels, camera, SIZE, SIZE)
+    seen = render.draw_blocks(voxels, camera, SIZE, SIZE)
     rgb, middle = seen.rgb_THWC[0].astype(float), SIZE // 2
     np.testing.assert_allclose(seen.depth_THW[0, middle, middle], 3 * CELL - 0.01, atol=1e-4)
     assert seen.ids_THW[0, middle, middle] == BROWN
     # Light as the formula says: met across x, at 1.49 m; far from corners.
-    wanted = np.array(PALETTE["brown"]) * 0.88 / (1 + (1.49 / block_light.HALF_M) ** 2)
+    wanted = np.array(PALETTE["brown"]) * 0.88 / (1 + (1.49 / march.HALF_M) ** 2)
     np.testing.assert_allclose(rgb[middle, middle], wanted, atol=1.0)
     floor, ceiling = rgb[-1, middle].mean(), rgb[0, middle].mean()
     assert floor > 1.3 * ceiling
@@ -56,8 +56,8 @@ def test_a_room_of_blocks_is_lit_by_side_distance_and_corner():
 def test_where_nothing_is_met_there_is_no_depth():
     voxels, camera = room()
     nothing = dataclasses.replace(voxels, classes_TXYZ=np.zeros_like(voxels.classes_TXYZ))
-    seen = voxel_pictures.draw_blocks(nothing, camera, SIZE, SIZE)
-    assert (seen.rgb_THWC == voxel_pictures.AIR).all()
+    seen = render.draw_blocks(nothing, camera, SIZE, SIZE)
+    assert (seen.rgb_THWC == render.AIR).all()
     assert not seen.depth_THW.any()
     assert (seen.ids_THW == -1).all()
 
@@ -69,7 +69,7 @@ def test_an_episode_of_cells_shows_the_cells_it_records():
     config = dataclasses.replace(plain, voxels=voxels, moving=True)
     episode = read_episode(make_episode(config, "train", 0))
     frames, cells = episode.frames(range(3)), episode.voxels(range(3))
-    again = voxel_pictures.draw_blocks(cells, frames.camera, 32, 32)
+    again = render.draw_blocks(cells, frames.camera, 32, 32)
     np.testing.assert_array_equal(again.rgb_THWC, frames.rgb_THWC)
     drawn = grid_from_camera(cells, 1, frames.camera, 32, 32)
     np.testing.assert_allclose(frames.depth_THW[1], drawn.depth_HW, atol=2e-3)

@@ -24,9 +24,8 @@ from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
 from pewm_jax.data.record_format import DamagedError
 from pewm_jax.data.recordings import turned
 from pewm_jax.data.scenes import house
-from pewm_jax.data.show import draw_voxels
+from pewm_jax.data.show import draw_voxels, grid_from_camera
 from pewm_jax.data.validate import ValidateConfig, validate
-from pewm_jax.data.voxel_pictures import grid_from_camera
 from pewm_jax.data.voxelise import crop_grids, fill, lattice_of, split_at_borders
 from pewm_jax.data.voxels import PALETTE, VoxelFrames, VoxelsConfig, class_ids, table_colours
 from pewm_jax.geometry.cameras import unproject
@@ -34,7 +33,7 @@ from pewm_jax.houses.kinds import GROUPS, KINDS, OTHER, kind_of
 from pewm_jax.worlds.pewm.world import PEWM
 from tests.data.test_importer import config as import_config
 from tests.data.test_importer import record
-from tests.data.two_rooms import arrays, write_split
+from tests.data.two_rooms import arrays, clip_at, write_split
 from tests.helpers import tiny_config
 from tests.properties import examples
 
@@ -255,7 +254,7 @@ def test_a_clip_has_the_grids_of_its_frames():
     voxels = grids(30)
     episode = read_episode(write_episode(boxed(voxels, frames=30), "a", "box"))
     config = tiny_config(data=DataConfig(context=3))
-    clip = clips.clip_at(config, episode, 3, stride=2)
+    clip = clip_at(config, episode, 3, stride=2)
     np.testing.assert_array_equal(clip.extras["classes_TXYZ"], voxels.classes_TXYZ[3:20:2])
     np.testing.assert_array_equal(clip.extras["origin_T3"], voxels.origin_T3[3:20:2])
     batch = clips.stack([clip, clip])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pewm_jax.config import ActionConfig
+from pewm_jax.data.clips import Choice, choose_context, cut
 from pewm_jax.data.dataset import Manifest, describe_shard, write_manifest, write_shard
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.navigation import NavGrid
@@ -13,6 +14,14 @@ from pewm_jax.geometry.cameras import intrinsics_from_fov, ray_directions
 
 LOW, HIGH = np.array([0.0, 0.0, 0.0]), np.array([6.0, 4.0, 2.5])
 CAMERA_Z = 1.25
+
+
+def clip_at(config, episode, start, stride=1, frames=None):
+    """The clip at given frames of an episode; its context is evenly spaced."""
+    count = config.model.clip.frames if frames is None else frames
+    slots = config.data.context
+    chosen = Choice(start + stride * np.arange(count), choose_context(start, slots))
+    return cut(episode, chosen, slots)
 
 
 def two_rooms() -> NavGrid:

@@ -225,13 +225,13 @@ def test_the_code_that_pages_show_exists(page):
 
 
 def test_code_is_read_from_the_file_without_its_docstring():
-    found = code.snippet("pewm_jax/geometry/plucker.py", "plucker")
+    found = code.snippet("pewm_jax/geometry/cameras.py", "plucker")
     lines = (ROOT / found.file).read_text().splitlines()
     assert lines[found.first - 1].startswith("def plucker(")
     assert lines[found.last - 1] == found.text.splitlines()[-1]
     assert "Plücker coordinates" not in found.text
     with pytest.raises(KeyError, match="has no pluecker"):
-        code.snippet("pewm_jax/geometry/plucker.py", "pluecker")
+        code.snippet("pewm_jax/geometry/cameras.py", "pluecker")
 
 
 def test_the_reference_has_every_package_and_every_file():
@@ -319,5 +319,5 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     page = (tmp_path / "site" / "paper" / "index.html").read_text()
-    assert "geometry/plucker.py, lines" in page
+    assert "geometry/cameras.py, lines" in page
     shutil.rmtree(tmp_path / "site")

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import pewm_jax
-from pewm_jax.geometry import actions, cameras, plucker
+from pewm_jax.geometry import actions, cameras
 from pewm_jax.memory import interface as memories
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.memory.points import PointsConfig
@@ -95,8 +95,8 @@ EXACT = {
     "transform": lambda: cameras.transform_points(POSE, POINTS[0]),
     "unproject": lambda: cameras.unproject(DEPTH, CAMERA),
     "project": lambda: cameras.project(POINTS, CAMERA),
-    "rays": lambda: plucker.plucker(CAMERA, 16, 16),
-    "ray latents": lambda: plucker.camera_latents(CAMERA, 16, 16, 8, 1),
+    "rays": lambda: cameras.plucker(CAMERA, 16, 16),
+    "ray latents": lambda: cameras.camera_latents(CAMERA, 16, 16, 8, 1),
     "step": lambda: actions.step_pose(POSE, jnp.ones(3)),
     "integrate": lambda: actions.integrate(POSE, jnp.ones((2, 3))),
     "between": lambda: actions.actions_between(CAMERA.world_from_camera),
@@ -158,3 +158,45 @@ def test_products_in_geometry_go_through_the_two_functions_of_full_precision(pat
         if named and node.value.id == "jnp" and node.attr in products:
             found.append(node.lineno)
     assert len(found) == (2 if path.stem == "cameras" else 0), (path, found)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_ray_passes_through_what_the_pixel_sees(seed):
+    rng = np.random.default_rng(seed)
+    camera = random_camera(rng, 2, 5, 7)
+    rays = np.asarray(cameras.plucker(camera, 5, 7))
+    moment, direction = rays[..., :3], rays[..., 3:]
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1, atol=1e-5)
+    depth = rng.uniform(1, 5, (2, 5, 7)).astype(np.float32)
+    points = np.asarray(cameras.unproject(depth, camera))
+    np.testing.assert_allclose(np.cross(points, direction), moment, atol=2e-5)
+
+
+def test_directions_are_not_moved_by_translation():
+    rng = np.random.default_rng(0)
+    camera = random_camera(rng, 1)
+    shifted = np.array(camera.world_from_camera)
+    shifted[:, :3, 3] += [3, -1, 2]
+    before = cameras.plucker(camera, 4, 4)[..., 3:]
+    after = cameras.plucker(Camera(camera.intrinsics_4, shifted), 4, 4)[..., 3:]
+    np.testing.assert_array_equal(before, after)
+
+
+def test_folding_repeats_the_first_frame_and_groups_the_others():
+    frames = jnp.arange(9)[:, None]
+    np.testing.assert_array_equal(
+        cameras.fold_frames(frames, 4)[..., 0], [[0, 0, 0, 0], [1, 2, 3, 4], [5, 6, 7, 8]]
+    )
+
+
+def test_camera_latents_are_pooled_relative_and_keep_frame_order():
+    rng = np.random.default_rng(1)
+    camera = random_camera(rng, 9)
+    latents = cameras.camera_latents(camera, 16, 24, 4, 4)
+    assert latents.shape == (3, 4, 6, 24)
+    rays = cameras.plucker(cameras.relative_to_first(camera), 16, 24)
+    frame_6 = np.asarray(rays[6, :4, :4]).mean((0, 1))
+    np.testing.assert_allclose(latents[2, 0, 0, 6:12], frame_6, atol=1e-6)
+    moved = Camera(camera.intrinsics_4, rigid(rng) @ camera.world_from_camera)
+    again = cameras.camera_latents(moved, 16, 24, 4, 4)
+    np.testing.assert_allclose(again, latents, atol=1e-5)

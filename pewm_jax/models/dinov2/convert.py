@@ -21,7 +21,7 @@ import numpy as np
 from pewm_jax.errors import UserError
 from pewm_jax.io import tree
 from pewm_jax.io.published import LINEAR, SAME, Entry, Transform
-from pewm_jax.io.sources import Renamed, Source
+from pewm_jax.io.sources import Source, renamed
 from pewm_jax.models.dinov2.config import HEAD_DIM, DINOv2Config
 
 _UNUSED = re.compile(r"(embeddings\.)?mask_token|classifier\.(weight|bias)")
@@ -242,9 +242,9 @@ def with_transformers_names(source: Source) -> Source:
             for part, what in enumerate(("query", "key", "value")):
                 views[f"{stem}.{what}.{qkv[2]}"] = (theirs, part, 3)
             continue
-        for pattern, renamed in _HUB:
+        for pattern, ours in _HUB:
             if hub := re.fullmatch(pattern, name):
-                name = hub.expand(renamed)
+                name = hub.expand(ours)
                 break
         views[name] = (theirs, 0, 1)
-    return Renamed(source, views)
+    return renamed(source, views)

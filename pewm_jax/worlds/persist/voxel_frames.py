@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.data.voxels import PALETTE
-from pewm_jax.geometry import block_light
+from pewm_jax.geometry import march
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
 from pewm_jax.memory.class_grid import EMPTY, UNKNOWN
@@ -200,9 +200,9 @@ def observe_cells(
     surface = (hits >= VOTES).reshape((side,) * 3)
 
     # The light on visible cells is known, and so are their own colours.
-    borders = block_light.side_of((way_HW3 + (eye - corner_3)) / size)
+    borders = march.side_of((way_HW3 + (eye - corner_3)) / size)
     ones = jnp.ones(depth_HW.shape)
-    lit = block_light.light(surface, corner_3, size, eye, way_HW3, ones, borders)
+    lit = march.light(surface, corner_3, size, eye, way_HW3, ones, borders)
     colour_HW = _nearest_colour(model, (rgb_HWC + 1) / 2 / lit[..., None])
     colours = model.memory.colours
     votes = jnp.zeros((side**3 + 1, colours), jnp.int32)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pewm_jax import worlds
-from pewm_jax.data import voxel_pictures
+from pewm_jax.data import render
 from pewm_jax.data.voxels import VoxelFrames, table_colours
-from pewm_jax.geometry import block_light
+from pewm_jax.geometry import march
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw, unproject
 from pewm_jax.geometry.march import through_pixels
 from pewm_jax.memory import class_grid
@@ -37,7 +37,7 @@ def furnished():
     pose = pose_from_yaw(np.array([-0.9, 4.6, 0.2]), 0.1)[None].astype(np.float32)
     camera = Camera(np.asarray(intrinsics_from_fov(SIZE, SIZE, 90.0), np.float32), pose)
     voxels = VoxelFrames(grid[None], LOW[None], CELL, class_grid.names(MEMORY))
-    seen = voxel_pictures.draw_blocks(voxels, camera, SIZE, SIZE)
+    seen = render.draw_blocks(voxels, camera, SIZE, SIZE)
     rgb = seen.rgb_THWC[0].astype(np.float32) / 127.5 - 1
     one = Camera(camera.intrinsics_4, camera.world_from_camera[0])
     return grid, rgb, seen.depth_THW[0], one
@@ -74,9 +74,9 @@ def test_the_light_that_is_read_is_the_light_that_was_drawn():
     grid, rgb, depth, camera = furnished()
     way = unproject(depth, camera) - camera.world_from_camera[:3, 3]
     at = (way + camera.world_from_camera[:3, 3] - LOW) / CELL
-    lit = block_light.light(
+    lit = march.light(
         grid > 0, LOW, CELL, camera.world_from_camera[:3, 3], way, np.ones(depth.shape),
-        block_light.side_of(at),
+        march.side_of(at),
     )  # fmt: skip
     one = Camera(camera.intrinsics_4[None], camera.world_from_camera[None])
     met = through_pixels(grid.astype(np.int32), LOW, CELL, one, SIZE, SIZE, 1).ids_L[0, ..., 0]
