@@ -28,7 +28,7 @@ from pewm_jax import __version__, worlds
 from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
 from pewm_jax.config import Config, UserError, World
-from pewm_jax.convert import output
+from pewm_jax.convert import pipeline
 from pewm_jax.data.dataset import read_manifest
 from pewm_jax.eval.evaluate import METRICS
 from pewm_jax.io import sources, tensor_files, tree, weights
@@ -54,9 +54,7 @@ def export(
 
     Args:
         run: a run folder made by ``train.py`` (or a converted checkpoint in the same form).
-        dst: the folder to create.
         dtype: ``bfloat16`` or ``float16``.
-        log: called with a line per step.
 
     Returns:
         ``dst``.
@@ -66,7 +64,7 @@ def export(
     """
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; give a run made by train.py.")
-    with output.new_folder(dst) as folder:
+    with pipeline.new_folder(dst) as folder:
         log(f"reading {run} …")
         config, params = rollouts.load_finished(run)
         if not config.model.EXPORTED:

@@ -85,9 +85,7 @@ def observed(model: AssembledModel, params: Params, seen: Observed) -> Condition
     By default the latents are joined to the input, zero for the frames to be imagined.
 
     Args:
-        model: the model.
         params: the world model's parameters; those under ``image`` are the backbone's to use.
-        seen: the observed frames.
 
     Returns:
         Conditioning with ``settings.shown_channels(model)`` joined channels: by default as many as

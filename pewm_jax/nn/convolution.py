@@ -69,8 +69,6 @@ def convolve_grid(x_NXYZC: Array, kernel_XYZIO: Array, form: Form = "auto") -> A
     """Convolve grids with a cubic kernel of odd side, with zeros around the grid.
 
     Args:
-        x_NXYZC: grids.
-        kernel_XYZIO: the kernel, in the dtype of the grids.
         form: how it is computed; the result is the same up to rounding.
     """
     if kernel_XYZIO.shape[0] == 1:

@@ -60,7 +60,6 @@ def constrain(x: Array, *names: str | None) -> Array:
     """Constrain an array's sharding by the names of its axes.
 
     Args:
-        x: any array.
         names: one per leading axis.
     """
     if not _sizes():

@@ -25,8 +25,8 @@ from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
 from pewm_jax.models.clip.config import CLIPVisionConfig
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
-from pewm_jax.models.svd.vae_codec import SVDVAECodec
+from pewm_jax.models.svd.unet import SVDUNetBackbone
+from pewm_jax.models.svd.vae import SVDVAECodec
 from pewm_jax.plan import hlo
 from pewm_jax.plan.measure import QUICK
 from pewm_jax.train import flops, sharding, step

@@ -51,8 +51,6 @@ def apply(config: CLIPVisionConfig, params: Params, images_BHWC: Array) -> Array
     """Return the projected embedding of every image.
 
     Args:
-        config: the encoder.
-        params: its parameters.
         images_BHWC: (B, image_size, image_size, 3) floats, already normalised (see
             ``preprocess``). Their dtype is the dtype of the computation; norms and softmax are in
             float32.
@@ -91,7 +89,6 @@ def preprocess(rgb_BHWC: Array, size: int = 224) -> Array:
 
     Args:
         rgb_BHWC: (B, H, W, 3) floats in [−1, 1], at least 2 × 2 pixels.
-        size: the new side in pixels.
 
     Returns:
         (B, size, size, 3) in the dtype of the colours.

@@ -147,9 +147,6 @@ class DiTConfig:
     def published(cls, name: str) -> Self:
         """Return the configuration of a published CogVideoX network.
 
-        Args:
-            name: one of ``PUBLISHED``.
-
         Raises:
             ConfigError: there is no such network.
         """
@@ -298,9 +295,6 @@ class VAEConfig:
     @classmethod
     def published(cls, variant: str) -> Self:
         """Return the autoencoder of a published CogVideoX.
-
-        Args:
-            variant: ``2b``, ``5b``, ``5b-I2V``, ``1.5-5B`` or ``1.5-5B-I2V``.
 
         Raises:
             ConfigError: another name.

@@ -61,10 +61,8 @@ class LayerNormZero(nn.Module):
         """Return normalised and modulated tokens, and the gate (B, N, D) of each token.
 
         Args:
-            tokens_BND: (B, L + N, D) text and video tokens.
             time_BE: (B, E) time embedding; or (B, 1 + t, E): the text's, then one for each token
                 in time.
-            layout: the order of the tokens.
         """
         width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
         linear = nn.Dense(
@@ -100,10 +98,7 @@ class Block(nn.Module):
         """Return the updated tokens.
 
         Args:
-            tokens_BND: (B, L + N, D) text and video tokens.
-            time_BE: (B, E) time embedding.
             angles_NR: (L + N, head_dim/2) rotary angles in the order of the tokens, or None.
-            layout: the order of the tokens.
         """
         before: Any = nn.remat(Block.before, policy=KEEP, prevent_cse=False, static_argnums=(4,))
         after: Any = nn.remat(Block.after, policy=KEEP, prevent_cse=False, static_argnums=(5,))
@@ -241,8 +236,6 @@ def apply(
     """Predict from noisy latents.
 
     Args:
-        config: the transformer.
-        params: its parameters.
         latents_BthwC: (B, t, h, w, C) input latents; h and w are multiples of the patch, t of
             ``patch_t``. Their dtype is the dtype of the computation.
         text_BLD: (B, L, text_dim) text tokens.
@@ -251,7 +244,6 @@ def apply(
         ofs_B: (B,) second scalar of 1.5-5B-I2V; None means ``OFS``.
         memory_block: function of the video tokens that runs after every block and reads the
             memory; tokens are in the order of ``layout_of``.
-        memory_params: its parameters, stacked over layers.
         modulation_BtE: (B, t', E) added to the time embedding of each token in time, not to the
             text's.
         added_BND: (B, N, D) added to the embedded video tokens, in the order of ``layout_of``.

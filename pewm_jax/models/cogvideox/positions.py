@@ -24,10 +24,6 @@ Grid = tuple[int, int, int]
 def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
     """Return the token grid of latents, or refuse sizes that the network cannot take.
 
-    Args:
-        config: the transformer.
-        shape: (B, t, h, w, C) of the latents.
-
     Raises:
         UserError: the network cannot take latents of this size.
     """
@@ -91,7 +87,6 @@ def add(config: DiTConfig, tokens_BND: Array, table_ND: Array | None, grid: Grid
     """Add the positions that are not rotary to text and video tokens: a table or a sinusoid.
 
     Args:
-        config: the transformer.
         tokens_BND: (B, L + t·h·w, D) text tokens, then video tokens.
         table_ND: (L + N, D) the learned table of the sample size, if there is one.
         grid: t, h, w.
@@ -168,7 +163,6 @@ def rope_angles(
         frames: (t,) positions in time.
         rows: (h,) positions down the picture.
         columns: (w,) positions across the picture.
-        head_dim: channels of a head.
     """
     parts = (head_dim // 4, head_dim // 8 * 3, head_dim // 8 * 3)
     grid = np.meshgrid(frames, rows, columns, indexing="ij")

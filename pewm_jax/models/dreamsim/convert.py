@@ -69,9 +69,6 @@ _AROUND: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
 def read(folder: Path) -> Params:
     """Read all encoders, with DreamSim's updates merged.
 
-    Args:
-        folder: see above.
-
     Returns:
         ``{encoder: parameters}`` as ``models.dreamsim.model.encode`` takes them, float32.
 

@@ -64,7 +64,6 @@ def distance(params: Params, a_BHWC: Array, b_BHWC: Array) -> Array:
     Args:
         params: from ``models.dreamsim.convert.read``: a vision transformer for each encoder.
         a_BHWC: (B, H, W, 3) colours in [0, 1]; resized by ``resized``.
-        b_BHWC: the same shape.
     """
     a, b = embed(params, a_BHWC), embed(params, b_BHWC)
     return 1 - (a * b).sum(-1)
@@ -74,7 +73,6 @@ def embed(params: Params, rgb_BHWC: Array) -> Array:
     """Return the joined features of pictures, (B, F) float32, centred and of length 1.
 
     Args:
-        params: see ``distance``.
         rgb_BHWC: (B, H, W, 3) colours in [0, 1].
     """
     parts = []
@@ -104,7 +102,6 @@ def encode(name: Encoder, params: Params, images_BHWC: Array) -> Array:
     """Return one encoder's features of pictures, (B, F) float32.
 
     Args:
-        name: of the encoder.
         params: its parameters: ``patch_embed``, ``cls_token`` (D,), ``position_embed`` (1 + N, D),
             ``blocks`` (stacked over layers), and of the CLIPs ``norm_before``, ``norm`` and
             ``projection`` (D, F).

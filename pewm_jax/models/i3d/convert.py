@@ -89,9 +89,6 @@ def find(path: str | Path | None = None) -> Path:
 def read(path: Path) -> Params:
     """Read a file of weights.
 
-    Args:
-        path: the file, of any kind named above.
-
     Returns:
         Parameters as ``models.i3d.model.apply`` takes them, float32.
 

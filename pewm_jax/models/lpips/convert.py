@@ -68,7 +68,6 @@ def read(path: Path, net: Net | None = None) -> tuple[Net, Params]:
     """Read a file of weights.
 
     Args:
-        path: the file, of any kind named above.
         net: the network that it must be of; by default whichever it is.
 
     Returns:

@@ -106,10 +106,7 @@ def apply(net: Net, params: Params, a_NHWC: Array, b_NHWC: Array) -> Array:
     It can be differentiated: where all features of a position are 0, so is the gradient.
 
     Args:
-        net: the network.
-        params: its parameters, of the shapes of ``shapes(net)``.
         a_NHWC: (N, H, W, 3) floats in [−1, 1].
-        b_NHWC: the same shape.
 
     Raises:
         UserError: the pictures are smaller than the network takes, or of different shapes.
@@ -130,8 +127,6 @@ def describe(net: Net, params: Params, x_NHWC: Array) -> tuple[Array, ...]:
     """Return the layers' features of pictures, of length 1 at each position.
 
     Args:
-        net: the network.
-        params: its parameters.
         x_NHWC: (N, H, W, 3) floats in [−1, 1], at least as large as ``require_size`` requires.
 
     Returns:

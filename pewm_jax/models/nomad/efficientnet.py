@@ -109,7 +109,6 @@ def apply(width: float, depth: float, stages: int, params: Params, pictures_BHWC
         width: channels as a multiple of B0's.
         depth: blocks as a multiple of B0's.
         stages: stages of blocks, 7 in B0.
-        params: of ``shapes``.
         pictures_BHWC: (B, H, W, colours) floats, normalised; their dtype is the computation's.
 
     Returns:

@@ -120,8 +120,6 @@ def encode(
     """Return the condition of a history and a goal.
 
     Args:
-        config: the network.
-        params: its parameters.
         observations_BTHWC: (B, context + 1, H, W, 3) floats from ``preprocess``, the present last;
             their dtype is the computation's.
         goal_BHWC: (B, H, W, 3) the goal image; any values where it is masked.
@@ -160,11 +158,8 @@ def denoise(
     """Predict the noise in normalised steps between waypoints.
 
     Args:
-        config: its sizes.
-        params: of ``shapes``, ``denoiser`` among them.
         noisy_BN2: (B, N, 2) floats; N is a multiple of 2 to the number of halvings.
         time_B: (B,) noise levels, 0 for the least.
-        condition_BD: (B, dim).
 
     Returns:
         (B, N, 2).

@@ -167,8 +167,6 @@ def run(
     """Run all blocks.
 
     Args:
-        config: the blocks.
-        parts: which parts each has.
         params: their parameters, stacked over layers.
         x_BTND: (B, T, N, D) tokens of T frames, those after the cache's; their dtype is the dtype
             of the computation.
@@ -238,9 +236,7 @@ def times_of(config: BlocksConfig, first: Array, frames: int, past: int) -> tupl
     """Return rotary angles (T, head_dim/2) of frames, and the attention mask over past and present.
 
     Args:
-        config: the blocks.
         first: () number of the first of the frames.
-        frames: T.
         past: slots of the frames before, of which the last one is frame ``first`` − 1.
     """
     half = config.head_dim // 2

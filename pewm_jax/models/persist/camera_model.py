@@ -80,14 +80,10 @@ def apply(
     """Predict the step to each frame's camera.
 
     Args:
-        config: the network.
-        params: its parameters.
         classes_BTXYZ: (B, T, X, Y, Z) class ids of the frame that the action leads to; the grid or
             its innermost part.
         camera_BTN: (B, T, 10) numbers of the camera before the action; see ``camera_numbers``.
         actions_BTA: (B, T, A) the action that leads to each frame.
-        dtype: of the computation.
-        cache: the frames before these; see ``frame_blocks``.
 
     Returns:
         ``(steps_BT6, cache)``: metres and radians, float32; the cache with these frames, or None.

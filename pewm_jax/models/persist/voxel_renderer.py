@@ -81,11 +81,9 @@ def cast_rays(
     With ``rays`` r above 1 the shape is (T, h·r, w·r, L).
 
     Args:
-        config: the network.
         classes_TXYZ: class ids of each frame's grid.
         low_T3: the corner of each grid with the smallest coordinates, metres.
         cell_m: side of a voxel, metres.
-        camera: (T,) cameras.
         size: height and width of the images that their intrinsics are for, pixels.
     """
     height, width = config.height * config.rays, config.width * config.rays
@@ -116,10 +114,6 @@ def features(
     With several rays per latent, first all of the first ray.
 
     Args:
-        config: the network.
-        params: its parameters.
-        layers: the hits of the rays, from ``cast_rays``.
-        dtype: of the computation.
         drawn_hwC: (..., h, w, C) latents of the voxels drawn in the colours of their classes,
             where the network takes them (``config.drawn``); they are the last channels.
 
@@ -176,14 +170,10 @@ def apply(
     """Predict the target of the noise from noisy latents of images.
 
     Args:
-        config: the network.
-        params: its parameters.
         latents_BThwC: (B, T, h, w, C) noisy latents of T frames; their dtype is the dtype of the
             computation.
-        times_BT: each frame's time, in the network's units.
         features_BThwF: the voxels as each frame's camera sees them, from ``features``.
         actions_BTA: the action that leads to each frame, where the network takes one.
-        cache: the frames before these; see ``frame_blocks``.
 
     Returns:
         ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with

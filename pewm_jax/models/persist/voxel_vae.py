@@ -140,7 +140,6 @@ def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:
     """Return parameters that normalise latents of this mean and deviation to mean 0, variance 1.
 
     Args:
-        params: this network's.
         mean_C: (C,) mean of each channel of the latents that ``params`` give.
         scale_C: (C,) their standard deviation.
     """
@@ -155,10 +154,7 @@ def moments(
     """Return mean and log variance of the latents before they are normalised.
 
     Args:
-        config: the network.
-        params: its parameters.
         classes_BXYZ: (B, side, side, side) integer class ids.
-        dtype: of the computation.
 
     Returns:
         Two arrays (B, side/f, side/f, side/f, C), float32, where f is ``config.factor``.
@@ -201,10 +197,7 @@ def features(
     """Return the input of the layer that scores classes, (B, X, Y, Z, embed).
 
     Args:
-        config: the network.
-        params: its parameters.
         latents_BxyzC: normalised latents, as ``encode`` gives them.
-        dtype: of the computation.
     """
     x = latents_BxyzC * params["latent_scale_C"] + params["latent_mean_C"]
     return _features(config, params["decoder"], x.astype(dtype))
@@ -235,13 +228,6 @@ def loss(
     dtype: jnp.dtype = jnp.float32,
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of a batch of grids: cross-entropy of every cell, and the divergence.
-
-    Args:
-        config: the network.
-        params: its parameters.
-        classes_BXYZ: (B, side, side, side) class ids.
-        key: randomness of the latents.
-        dtype: of the computation.
 
     Returns:
         ``(loss, measured)``: ``cross_entropy`` per compared cell (occupied ones weigh

@@ -23,8 +23,8 @@ from pewm_jax.io.published import (
     rename,
 )
 from pewm_jax.models.svd import unet, vae
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
-from pewm_jax.models.svd.vae_codec import SVDVAECodec
+from pewm_jax.models.svd.unet import SVDUNetBackbone
+from pewm_jax.models.svd.vae import SVDVAECodec
 
 UNET_CLASS = "UNetSpatioTemporalConditionModel"
 """The reference's class."""
@@ -183,16 +183,15 @@ VAE_CLASS = "AutoencoderKLTemporalDecoder"
 """The reference's class."""
 BLOCK = "DownEncoderBlock2D"
 """The only kind of block on the way down."""
-_VAE_DEFAULTS: dict[str, Any] = {
-    "in_channels": 3,
-    "out_channels": 3,
-    "latent_channels": 4,
-    "block_out_channels": [64],
-    "down_block_types": [BLOCK],
-    "layers_per_block": 1,
-    "scaling_factor": 0.18215,
+_VAE_FIELDS: dict[str, tuple[str, Any]] = {
+    "in_channels": ("in_channels", 3),
+    "out_channels": ("out_channels", 3),
+    "latent_channels": ("latent_channels", 4),
+    "block_out_channels": ("widths", [64]),
+    "layers_per_block": ("resnets", 1),
+    "scaling_factor": ("scaling_factor", 0.18215),
 }
-"""What diffusers takes for settings that a file leaves out."""
+"""Their setting → our field, and what diffusers takes for one that a file leaves out."""
 _VAE_WITHOUT_EFFECT = {"sample_size": 768, "force_upcast": True}
 """Settings that the network does not read, and what is written for them."""
 _VAE_RULES = (
@@ -208,30 +207,14 @@ def vae_config_from_diffusers(values: dict[str, Any]) -> SVDVAECodec:
     Raises:
         UserError: another class, or a setting that is unknown or not supported.
     """
+    checked = published.defaults(_VAE_FIELDS)
     given = published.read_settings(
-        values, "The VAE", VAE_CLASS, _VAE_DEFAULTS, _VAE_WITHOUT_EFFECT
+        values, "The VAE", VAE_CLASS, {**checked, "down_block_types": [BLOCK]}, _VAE_WITHOUT_EFFECT
     )
-    widths = given["block_out_channels"]
-    whole = ("in_channels", "out_channels", "latent_channels", "layers_per_block")
-    for key, numbers in (*((k, [given[k]]) for k in whole), ("block_out_channels", widths)):
-        if not isinstance(numbers, list | tuple) or any(type(n) is not int for n in numbers):
-            raise UserError(f"The VAE's {key} is {given[key]!r}; it must be of whole numbers.")
-    if list(given["down_block_types"]) != [BLOCK] * len(widths):
-        raise UserError(
-            f"The VAE's down_block_types is {given['down_block_types']!r}; only one {BLOCK} per "
-            "level is known."
-        )
-    factor = given["scaling_factor"]
-    if isinstance(factor, bool) or not isinstance(factor, int | float):
-        raise UserError(f"The VAE's scaling_factor is {factor!r}; it must be a number.")
-    return SVDVAECodec(
-        in_channels=given["in_channels"],
-        out_channels=given["out_channels"],
-        latent_channels=given["latent_channels"],
-        widths=tuple(widths),
-        resnets=given["layers_per_block"],
-        scaling_factor=float(factor),
-    )
+    published.require_kinds(given, "The VAE", checked)
+    only = {"down_block_types": [BLOCK] * len(given["block_out_channels"])}
+    published.require_only(given, "The VAE", only)
+    return SVDVAECodec(**published.read_fields(_VAE_FIELDS, given))
 
 
 def vae_config_to_diffusers(config: SVDVAECodec) -> dict[str, Any]:
@@ -239,13 +222,8 @@ def vae_config_to_diffusers(config: SVDVAECodec) -> dict[str, Any]:
     return {
         "_class_name": VAE_CLASS,
         **_VAE_WITHOUT_EFFECT,
-        "in_channels": config.in_channels,
-        "out_channels": config.out_channels,
-        "latent_channels": config.latent_channels,
-        "block_out_channels": list(config.widths),
+        **published.write_fields(_VAE_FIELDS, config),
         "down_block_types": [BLOCK] * len(config.widths),
-        "layers_per_block": config.resnets,
-        "scaling_factor": config.scaling_factor,
     }
 
 

@@ -4,21 +4,34 @@ It predicts from noisy latents, to which the latents of the conditioning image a
 embedding of that image, and three scalars. A further embedding per frame can be added to the time
 embedding wherever that one modulates the network, in space and in time alike. This is how actions
 steer it (arXiv 2601.15284, Eq. 5).
+
+As a backbone (``SVDUNetBackbone``) it gets the observed image in three ways, as in the reference's
+pipeline: its latents are joined to those of every frame, its embedding (CLIP's) is attended to, and
+a scalar states the noise that was added before it was encoded. Two more scalars, frames per second
+and the amount of motion, are settings. It has no place where a memory could be read.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable, Iterator
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
 
-from pewm_jax.errors import UserError
+from pewm_jax.config.parts import Backbone, Rules
+from pewm_jax.errors import UserError, require
+from pewm_jax.models import interface as backbones
+from pewm_jax.models.clip import model as clip_vision
+from pewm_jax.models.interface import NO_READERS, Conditioning, Observed, Readers
 from pewm_jax.models.svd import layers as svd_layers
 from pewm_jax.models.svd.config import SVDUNetConfig
 from pewm_jax.nn import layers, placement
 from pewm_jax.nn.parameters import Leaf, convolution, draw
+from pewm_jax.nn.parameters import mlp as mlp_leaves
 from pewm_jax.nn.parameters import norm as norm_leaves
 from pewm_jax.nn.video_convolution import SAME, convolve_frames
 from pewm_jax.types import Array, Params
@@ -26,6 +39,111 @@ from pewm_jax.types import Array, Params
 EPS, EPS_COARSE = 1e-6, 1e-5
 """Added to the variances of residual blocks: on the way up and in levels with attention; and in
 the bottom, on the way down without attention, and in the last norm."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SVDUNetBackbone(SVDUNetConfig, Backbone):
+    """The U-Net of Stable Video Diffusion as the denoiser of a world model.
+
+    It takes any number of channels: those that codec and control have.
+    """
+
+    SHARDING: ClassVar[Rules] = (
+        (r"backbone/conv_out/kernel", P("fsdp", None)),
+        (r"(backbone|image)/(.*/)?kernel", P(None, "fsdp")),
+        (r"(backbone|image)/(.*/)?(bias|scale|mix)", P()),
+        (r"image/(cls_token|position_embed)", P("fsdp")),
+    )
+    """Weights are stored split and gathered for use; each device computes its own clips."""
+
+    def check(self, model: Any) -> None:
+        """Refuse a model that does not fit the network; any size of frames does."""
+        require(
+            self.added == 3,
+            f"backbone.added is {self.added}: a world model gives three scalars, frames per "
+            "second, motion bucket and the noise of the image; use 3.",
+        )
+        require(
+            self.image.projection == self.image_dim,
+            f"backbone.image.projection is {self.image.projection} and backbone.image_dim is "
+            f"{self.image_dim}: the image's embedding is attended to, so use the same.",
+        )
+        require(
+            not model.noise.per_frame,
+            "noise.per_frame is true, and this backbone takes one noise level for a clip: use "
+            "false.",
+        )
+
+    def init(self, key: Array, in_channels: int, out_channels: int) -> Params:
+        """Return random parameters."""
+        sized = dataclasses.replace(self, in_channels=in_channels, out_channels=out_channels)
+        return init(sized, key)
+
+    def init_image(self, key: Array) -> Params:
+        """Return random parameters of the image encoder."""
+        return clip_vision.init(self.image, key)
+
+    def observed(self, model: Any, params: Params, seen: Observed) -> Conditioning:
+        """Condition on the observed image: its latents in every frame, its embedding, scalars.
+
+        The embedding is that of the colours before noise was added.
+
+        Raises:
+            UserError: more than one frame was observed.
+        """
+        first = seen.latents_BthwC
+        if first.shape[1] != 1:
+            raise UserError(
+                f"{first.shape[1]} frames were observed, and this backbone (svd_unet) takes "
+                "one: use history 1."
+            )
+        batch, frames = len(first), model.latent_shape[0]
+        rgb = clip_vision.preprocess(seen.rgb_BTHWC[:, 0], self.image.image_size)
+        embedding = clip_vision.apply(self.image, params["image"], rgb.astype(model.dtype))
+        scalars = jnp.asarray([self.fps - 1, self.motion_bucket], jnp.float32)
+        scalars = jnp.broadcast_to(scalars, (batch, 2))
+        return Conditioning(
+            joined_BthwC=jnp.repeat(first, frames, 1),
+            image_BMD=embedding[:, None],
+            scalars_BK=jnp.concatenate([scalars, seen.noise_B[:, None]], 1),
+        )
+
+    def apply(
+        self,
+        params: Params,
+        x_BthwC: Array,
+        time_B: Array,
+        conditioning: Conditioning,
+        readers: Readers = NO_READERS,
+    ) -> Array:
+        """Predict from noisy latents.
+
+        Raises:
+            UserError: a memory is to be read, or the image's embedding or the scalars are missing.
+        """
+        if readers.block is not None or readers.added_BND is not None:
+            raise UserError("this backbone (svd_unet) reads no memory: use memory.kind none.")
+        if conditioning.image_BMD is None or conditioning.scalars_BK is None:
+            raise UserError(
+                "this backbone (svd_unet) needs the embedding of an image and three scalars: make "
+                "its conditioning by worlds.world_model.condition."
+            )
+        dtype = x_BthwC.dtype
+        latents = backbones.joined(x_BthwC, conditioning).astype(dtype)
+        sized = dataclasses.replace(
+            self,
+            in_channels=params["conv_in"]["kernel"].shape[-2],
+            out_channels=params["conv_out"]["kernel"].shape[-1],
+        )
+        return apply(
+            sized,
+            params,
+            latents,
+            time_B,
+            conditioning.image_BMD.astype(dtype),
+            conditioning.scalars_BK,
+            conditioning.modulation_BtE,
+        )
 
 
 def layout(config: SVDUNetConfig) -> dict[str, tuple[int, ...]]:
@@ -50,8 +168,6 @@ def apply(
     """Predict from noisy latents.
 
     Args:
-        config: the network.
-        params: its parameters.
         latents_BThwC: (B, T, h, w, in_channels) scaled noisy latents and, joined to their channels,
             the latents of the image. Their dtype is the dtype of the computation. Any size will
             do.
@@ -94,7 +210,7 @@ def apply(
             x = attend(place, k, x, level)
             skips.append(x)
         if level < last:
-            x = svd_layers.downsample(place["resample"], x)
+            x = convolve_frames(place["resample"], x, 2, SAME)
             skips.append(x)
 
     place = params["mid"]
@@ -174,8 +290,8 @@ def _leaves(config: SVDUNetConfig) -> Iterator[Leaf]:
     widths, time = config.widths, config.time_dim
     last = len(widths) - 1
     yield from convolution("conv_in", (3, 3), config.in_channels, widths[0])
-    yield from svd_layers.mlp_leaves("time_embed", widths[0], time, time)
-    yield from svd_layers.mlp_leaves("added_embed", config.added * config.added_dim, time, time)
+    yield from mlp_leaves("time_embed", widths[0], time, time)
+    yield from mlp_leaves("added_embed", config.added * config.added_dim, time, time)
     skips = [widths[0]]
     inside = widths[0]
     for level, width in enumerate(widths):

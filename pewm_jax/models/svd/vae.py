@@ -4,11 +4,14 @@ The encoder sees one frame at a time. The decoder mixes neighbouring frames: its
 convolve over time as well. It therefore decodes the frames of a clip together, or some at a time
 with less memory and a slightly different result at the seams.
 
-Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``; ``svd_vae_codec`` does.
+Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``. ``SVDVAECodec`` does, a codec
+of the mean of the latents: it scales the latents that are denoised to unit variance, but not those
+of the conditioning image, as in the reference's pipeline.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from functools import partial
 
@@ -16,21 +19,43 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.errors import UserError
+from pewm_jax.models.interface import PublishedVAE
 from pewm_jax.models.svd import layers as svd_layers
 from pewm_jax.models.svd.config import SVDVAEConfig
 from pewm_jax.models.svd.layers import resnet_2d_leaves, resnet_leaves
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import linear
-from pewm_jax.nn.parameters import Leaf, convolution, draw
+from pewm_jax.nn.parameters import Leaf, convolution, draw, levels
 from pewm_jax.nn.parameters import linear as linear_leaves
 from pewm_jax.nn.parameters import norm as norm_leaves
-from pewm_jax.nn.video_convolution import SAME, convolve_frames
+from pewm_jax.nn.video_convolution import AFTER, SAME, convolve_frames, require_video
 from pewm_jax.types import Array, Params
 
 EPS, TEMPORAL_EPS = 1e-6, 1e-5
 """Added to the variances of group norms: of frames, and over time."""
-AFTER = ((0, 1), (0, 1))
-"""Padding of the encoder's strided convolutions."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SVDVAECodec(SVDVAEConfig, PublishedVAE):
+    """The autoencoder of Stable Video Diffusion; its weights come from a converted checkpoint."""
+
+    @property
+    def framewise(self) -> bool:
+        """Whether a latent frame is decoded by itself: no, with its neighbours."""
+        return False
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters."""
+        return init(self, key)
+
+    def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
+        """Encode a video to the mean of its latents."""
+        mean = encode(self, params, video_BTHWC)
+        return mean if condition else mean * self.scaling_factor
+
+    def decode(self, params: Params, latents_BthwC: Array) -> Array:
+        """Decode scaled latents to as many frames, all of a clip together."""
+        return decode(self, params, latents_BthwC / self.scaling_factor)
 
 
 def layout(config: SVDVAEConfig) -> dict[str, tuple[int, ...]]:
@@ -47,8 +72,6 @@ def encode(config: SVDVAEConfig, params: Params, video_BTHWC: Array) -> Array:
     """Encode every frame to the mean of its latents, which is the distribution's mode.
 
     Args:
-        config: the autoencoder.
-        params: its parameters.
         video_BTHWC: (B, T, H, W, C) floats in [−1, 1]; their dtype is that of the computation.
             H and W are multiples of ``config.spatial``.
 
@@ -58,7 +81,7 @@ def encode(config: SVDVAEConfig, params: Params, video_BTHWC: Array) -> Array:
     Raises:
         UserError: an array of another shape, or a size that is no multiple.
     """
-    _check(video_BTHWC, config.in_channels, "video_BTHWC")
+    require_video(video_BTHWC, config.in_channels, "video_BTHWC")
     height, width = video_BTHWC.shape[2:4]
     side = config.spatial
     if height % side or width % side:
@@ -75,8 +98,6 @@ def decode(
     """Decode latents to a video.
 
     Args:
-        config: the autoencoder.
-        params: its parameters.
         latents_BThwC: (B, T, h, w, z) latents, divided by ``config.scaling_factor`` again; their
             dtype is that of the computation.
         at_once: frames that are decoded together, as ``decode_chunk_size`` of diffusers'
@@ -88,7 +109,7 @@ def decode(
     Raises:
         UserError: an array of another shape, or ``at_once`` below 1.
     """
-    _check(latents_BThwC, config.latent_channels, "latents_BThwC")
+    require_video(latents_BThwC, config.latent_channels, "latents_BThwC")
     frames = latents_BThwC.shape[1]
     if at_once is not None and at_once < 1:
         raise UserError(f"at_once is {at_once}: decode at least one frame at a time.")
@@ -105,7 +126,7 @@ def _encode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
         for k in range(config.resnets):
             x = svd_layers.resnet_2d(place[f"resnet_{k}"], x, None, EPS)
         if "resample" in place:
-            x = svd_layers.downsample(place["resample"], x, AFTER)
+            x = convolve_frames(place["resample"], x, 2, AFTER)
     place = params["mid"]
     x = svd_layers.resnet_2d(place["resnet_0"], x, None, EPS)
     x = _attend(place["attend_0"], x)
@@ -145,38 +166,24 @@ def _attend(params: Params, x_BTHWC: Array) -> Array:
 def _encoder(config: SVDVAEConfig) -> Iterator[Leaf]:
     widths, moments = config.widths, 2 * config.latent_channels
     yield from convolution("encoder/conv_in", (3, 3), config.in_channels, widths[0])
-    inside = widths[0]
-    for level, width in enumerate(widths):
-        where = f"encoder/down_{level}"
-        for k in range(config.resnets):
-            yield from resnet_2d_leaves(f"{where}/resnet_{k}", inside, width)
-            inside = width
-        if level + 1 < len(widths):
-            yield from convolution(f"{where}/resample", (3, 3), width, width)
+    yield from levels("encoder/down", widths, config.resnets, resnet_2d_leaves)
     for k in range(2):
-        yield from resnet_2d_leaves(f"encoder/mid/resnet_{k}", inside, inside)
-    yield from _attention("encoder/mid/attend_0", inside)
-    yield from norm_leaves("encoder/norm_out", inside)
-    yield from convolution("encoder/conv_out", (3, 3), inside, moments)
+        yield from resnet_2d_leaves(f"encoder/mid/resnet_{k}", widths[-1], widths[-1])
+    yield from _attention("encoder/mid/attend_0", widths[-1])
+    yield from norm_leaves("encoder/norm_out", widths[-1])
+    yield from convolution("encoder/conv_out", (3, 3), widths[-1], moments)
     yield from linear_leaves("encoder/quant", moments, moments)
 
 
 def _decoder(config: SVDVAEConfig) -> Iterator[Leaf]:
     widths = config.widths[::-1]
-    inside = widths[0]
-    yield from convolution("decoder/conv_in", (3, 3), config.latent_channels, inside)
+    yield from convolution("decoder/conv_in", (3, 3), config.latent_channels, widths[0])
     for k in range(config.resnets):
-        yield from resnet_leaves(f"decoder/mid/resnet_{k}", inside, inside)
-    yield from _attention("decoder/mid/attend_0", inside)
-    for level, width in enumerate(widths):
-        where = f"decoder/up_{level}"
-        for k in range(config.resnets + 1):
-            yield from resnet_leaves(f"{where}/resnet_{k}", inside, width)
-            inside = width
-        if level + 1 < len(widths):
-            yield from convolution(f"{where}/resample", (3, 3), width, width)
-    yield from norm_leaves("decoder/norm_out", inside)
-    yield from convolution("decoder/conv_out", (3, 3), inside, config.out_channels)
+        yield from resnet_leaves(f"decoder/mid/resnet_{k}", widths[0], widths[0])
+    yield from _attention("decoder/mid/attend_0", widths[0])
+    yield from levels("decoder/up", widths, config.resnets + 1, resnet_leaves)
+    yield from norm_leaves("decoder/norm_out", widths[-1])
+    yield from convolution("decoder/conv_out", (3, 3), widths[-1], config.out_channels)
     yield from convolution("decoder/time_out", (3,), config.out_channels, config.out_channels)
 
 
@@ -184,13 +191,3 @@ def _attention(where: str, width: int) -> Iterator[Leaf]:
     yield from norm_leaves(f"{where}/norm", width)
     for name in ("to_q", "to_k", "to_v", "to_out"):
         yield from linear_leaves(f"{where}/{name}", width, width)
-
-
-def _check(x: Array, channels: int, name: str) -> None:
-    if x.ndim != 5 or x.shape[-1] != channels:
-        raise UserError(
-            f"{name} has shape {tuple(x.shape)}: five axes are needed, batch, time, height, width "
-            f"and {channels} channels last."
-        )
-    if not jnp.issubdtype(x.dtype, jnp.floating):
-        raise UserError(f"{name} holds {x.dtype}: convert it to floats first.")

@@ -12,8 +12,8 @@ from safetensors.numpy import load_file
 from pewm_jax.config import UserError
 from pewm_jax.convert import cosmos, pipeline
 from pewm_jax.models.wan import vae as model
-from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.models.wan.convert import VAE
+from pewm_jax.models.wan.vae import WanVAECodec
 from tests.models.cosmos.references import channels_first, channels_last
 from tests.models.svd.references import distance, draw, randomise
 
