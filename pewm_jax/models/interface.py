@@ -12,6 +12,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import AssembledModel
 from pewm_jax.config.parts import Codec, Rules
+from pewm_jax.errors import UserError
 from pewm_jax.types import Array, Params
 
 
@@ -113,6 +114,24 @@ def held(conditioning: Conditioning, latents_BthwC: Array) -> Array:
         return latents_BthwC
     there = conditioning.known_Bt[:, :, None, None, None]
     return jnp.where(there, conditioning.known_BthwC, latents_BthwC)
+
+
+def require_shape(name: str, value: Array | None, forms: tuple[tuple[int | str, ...], ...]) -> None:
+    """Refuse an argument of none of these shapes; a letter means any size, and None is accepted.
+
+    Raises:
+        UserError: it has another shape.
+    """
+    if value is None or any(_fits(value.shape, form) for form in forms):
+        return
+    texts = " or ".join(f"({', '.join(map(str, form))})" for form in forms)
+    raise UserError(f"{name} has shape {tuple(value.shape)}: it must be {texts}.")
+
+
+def _fits(shape: tuple[int, ...], form: tuple[int | str, ...]) -> bool:
+    return len(form) == len(shape) and all(
+        isinstance(side, str) or side == size for side, size in zip(form, shape, strict=True)
+    )
 
 
 class PublishedVAE(Codec):

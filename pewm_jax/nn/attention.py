@@ -350,8 +350,3 @@ def _pieces_backward(
     cut = tuple(_cut(x, blocks) for x in (q, normaliser, shared, grad))
     dq, dk, dv = jax.lax.map(head, (cut, k.swapaxes(0, 1), v.swapaxes(0, 1)))
     return _join(dq, q.shape[2]), dk.swapaxes(0, 1), dv.swapaxes(0, 1)
-
-
-def in_pieces(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, blocks: int) -> Array:
-    """Compute attention in ``blocks`` blocks of queries, one head at a time, on any platform."""
-    return _pieces_forward(q_BKND, k_BKMD, v_BKMD, blocks=blocks)[0]

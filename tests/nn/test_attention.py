@@ -30,13 +30,13 @@ def inputs(batch=2, heads=3, queries=13, keys=11, channels=8):
 def test_pieces_make_the_whole(blocks):
     q, k, v = inputs()
     want = blocked_attention.plain_attention(q, k, v)
-    got = blocked_attention.in_pieces(q, k, v, blocks)
+    got = blocked_attention._pieces_forward(q, k, v, blocks=blocks)[0]
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
 
 
 def test_large_logits_do_not_overflow():
     q, k, v = inputs()
-    got = blocked_attention.in_pieces(q * 1e3, k * 1e3, v, 2)
+    got = blocked_attention._pieces_forward(q * 1e3, k * 1e3, v, blocks=2)[0]
     np.testing.assert_allclose(
         got, blocked_attention.plain_attention(q * 1e3, k * 1e3, v), rtol=1e-3, atol=1e-3
     )

@@ -29,6 +29,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.errors import UserError
 from pewm_jax.models.cosmos.config import CosmosConfig
+from pewm_jax.models.interface import require_shape
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, placement
 from pewm_jax.nn.layers import linear, rms_norm
@@ -178,7 +179,7 @@ def apply(
         "fps": (None if fps is None else jnp.asarray(fps), ((),)),
     }
     for name, (value, forms) in wanted.items():
-        _require_shape(name, value, forms)
+        require_shape(name, value, forms)
     params = {
         name: leaf if name == "blocks" else jax.tree.map(placement.constrain, leaf)
         for name, leaf in params.items()
@@ -266,7 +267,7 @@ def _joined(
     batch, frames, height, width, channels = latents.shape
     parts = [latents]
     if condition is not None:
-        _require_shape("condition_BthwC", condition, ((batch, frames, height, width, "C"),))
+        require_shape("condition_BthwC", condition, ((batch, frames, height, width, "C"),))
         parts.append(condition.astype(latents.dtype))
         channels += condition.shape[-1]
     if channels != config.in_channels:
@@ -279,7 +280,7 @@ def _joined(
         raise UserError("padding_BHWC was given to a network without a padding mask.")
     if config.padding_mask:
         mask = jnp.zeros((1, height, width, 1)) if padding is None else padding
-        _require_shape("padding_BHWC", mask, ((1, "H", "W", 1), (batch, "H", "W", 1)))
+        require_shape("padding_BHWC", mask, ((1, "H", "W", 1), (batch, "H", "W", 1)))
         rows, columns = (
             np.arange(new) * old // new
             for old, new in zip(mask.shape[1:3], (height, width), strict=True)
@@ -310,22 +311,6 @@ def _grid(config: CosmosConfig, shape: tuple[int, ...]) -> tuple[int, int, int]:
             f"width: the network's positions reach {most}."
         )
     return grid
-
-
-def _require_shape(
-    name: str, value: Array | None, forms: tuple[tuple[int | str, ...], ...]
-) -> None:
-    """Refuse an array of none of these shapes; a letter means any size."""
-    if value is None:
-        return
-    for form in forms:
-        if len(form) == value.ndim and all(
-            isinstance(side, str) or side == size
-            for side, size in zip(form, value.shape, strict=True)
-        ):
-            return
-    texts = " or ".join(f"({', '.join(map(str, form))})" for form in forms)
-    raise UserError(f"{name} has shape {tuple(value.shape)}: it must be {texts}.")
 
 
 def run_block(

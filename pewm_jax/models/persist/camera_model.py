@@ -10,6 +10,7 @@ proj_out``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from pewm_jax.geometry.actions import CAMERA_NUMBERS, CAMERA_STEP_NUMBERS
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import CameraModelConfig
+from pewm_jax.nn.parameters import Leaf, linear
 from pewm_jax.types import Array, Params
 
 PARTS = ("time",)
@@ -26,17 +28,15 @@ SHARDING = frame_blocks.rules("camera_model")
 """Rules over the paths of its parameters under ``camera_model``."""
 
 
-def ends(config: CameraModelConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parameters around the blocks by path."""
+def ends(config: CameraModelConfig) -> Iterator[Leaf]:
+    """Yield path and shape of the parameters around the blocks."""
     width = config.blocks.width
-    last = frame_blocks.end_shapes(width, CAMERA_STEP_NUMBERS)
-    return {
-        "classes/kernel": (config.classes, config.embed),
-        **frame_blocks.mlp_shapes("voxels", config.inner**3 * config.embed, width),
-        **frame_blocks.mlp_shapes("camera", CAMERA_NUMBERS, width),
-        **frame_blocks.mlp_shapes("action", config.actions, width),
-        **{path: shape for path, shape in last.items() if not path.startswith("time_embed")},
-    }
+    yield "classes/kernel", (config.classes, config.embed)
+    yield from frame_blocks.mlp_shapes("voxels", config.inner**3 * config.embed, width)
+    yield from frame_blocks.mlp_shapes("camera", CAMERA_NUMBERS, width)
+    yield from frame_blocks.mlp_shapes("action", config.actions, width)
+    yield from linear("modulate_out", width, 2 * width)
+    yield from linear("proj_out", width, CAMERA_STEP_NUMBERS)
 
 
 def init(config: CameraModelConfig, key: Array) -> Params:

@@ -12,6 +12,7 @@ proj_out``, and ``faces`` and ``action`` where a variant has them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -26,6 +27,8 @@ from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import VoxelRendererConfig
 from pewm_jax.nn.layers import linear
+from pewm_jax.nn.parameters import Leaf
+from pewm_jax.nn.parameters import linear as linear_leaves
 from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Camera, Params
 
@@ -36,22 +39,18 @@ FACES = 4
 """Axes along which a ray can enter a voxel: three, or none."""
 
 
-def ends(config: VoxelRendererConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parameters around the blocks by path."""
+def ends(config: VoxelRendererConfig) -> Iterator[Leaf]:
+    """Yield path and shape of the parameters around the blocks."""
     width, cells = config.blocks.width, config.patch**2
-    made: dict[str, tuple[int, ...]] = {
-        "classes/kernel": (config.classes, config.embed),
-        "fold/kernel": (config.kernel * config.embed, config.fold),
-        "fold/bias": (config.fold,),
-        "patch_embed/kernel": ((config.latent_channels + config.features) * cells, width),
-        "patch_embed/bias": (width,),
-        **frame_blocks.end_shapes(width, config.latent_channels * cells),
-    }
+    inputs = (config.latent_channels + config.features) * cells
+    yield "classes/kernel", (config.classes, config.embed)
+    yield from linear_leaves("fold", config.kernel * config.embed, config.fold)
+    yield from linear_leaves("patch_embed", inputs, width)
+    yield from frame_blocks.end_shapes(width, config.latent_channels * cells)
     if config.sides:
-        made["faces/kernel"] = (FACES, config.embed)
+        yield "faces/kernel", (FACES, config.embed)
     if config.actions:
-        made |= frame_blocks.mlp_shapes("action", config.actions, width)
-    return made
+        yield from frame_blocks.mlp_shapes("action", config.actions, width)
 
 
 def init(config: VoxelRendererConfig, key: Array) -> Params:

@@ -270,20 +270,10 @@ def _check(
             f"width and {config.in_channels} channels last."
         )
     batch, frames = latents.shape[:2]
-    wanted: dict[str, tuple[Array, tuple[int | str, ...]]] = {
-        "timesteps_B": (timesteps, (batch,)),
-        "image_BMD": (image, (batch, "M", config.image_dim)),
-        "added_BK": (added, (batch, config.added)),
-    }
-    if modulation is not None:
-        wanted["modulation_BTE"] = (modulation, (batch, frames, config.time_dim))
-    for name, (value, shape) in wanted.items():
-        fits = len(value.shape) == len(shape) and all(
-            side in ("M", size) for side, size in zip(shape, value.shape, strict=True)
-        )
-        if not fits:
-            sides = ", ".join(map(str, shape))
-            raise UserError(f"{name} has shape {tuple(value.shape)}: it must be ({sides}).")
+    backbones.require_shape("timesteps_B", timesteps, ((batch,),))
+    backbones.require_shape("image_BMD", image, ((batch, "M", config.image_dim),))
+    backbones.require_shape("added_BK", added, ((batch, config.added),))
+    backbones.require_shape("modulation_BTE", modulation, ((batch, frames, config.time_dim),))
 
 
 def _leaves(config: SVDUNetConfig) -> Iterator[Leaf]:
