@@ -98,7 +98,7 @@ _MOVED = {
     "VoxelVAEConfig": "pewm_jax.models.persist.config",
     "BlocksConfig": "pewm_jax.models.persist.config",
     "DINOv2Config": "pewm_jax.models.dinov2.config",
-    "CLIPVisionConfig": "pewm_jax.models.clip.config",
+    "CLIPVisionConfig": "pewm_jax.models.clip.model",
     "ModulationConfig": "pewm_jax.controls.actions",
     "CameraConfig": "pewm_jax.controls.camera",
     "DINOv2EncoderConfig": "pewm_jax.models.dinov2.model",

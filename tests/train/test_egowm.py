@@ -23,7 +23,7 @@ from pewm_jax.data import abstract
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
-from pewm_jax.models.clip.config import CLIPVisionConfig
+from pewm_jax.models.clip.model import CLIPVisionConfig
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.models.svd.unet import SVDUNetBackbone
 from pewm_jax.models.svd.vae import SVDVAECodec

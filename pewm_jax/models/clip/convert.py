@@ -12,7 +12,7 @@ from pewm_jax.errors import UserError
 from pewm_jax.io import published
 from pewm_jax.io.published import LINEAR, Entry, Network
 from pewm_jax.models.clip import model
-from pewm_jax.models.clip.config import CLIPVisionConfig
+from pewm_jax.models.clip.model import CLIPVisionConfig
 
 CLASS = "CLIPVisionModelWithProjection"
 """The reference's class."""

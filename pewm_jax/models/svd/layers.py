@@ -14,7 +14,6 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.models.svd.config import GROUPS, SVDUNetConfig
 from pewm_jax.nn import layers
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import group_norm_affine, layer_norm, linear, mlp
@@ -25,6 +24,8 @@ from pewm_jax.nn.parameters import norm as norm_leaves
 from pewm_jax.nn.video_convolution import SAME, convolve_frames, convolve_upsampled
 from pewm_jax.types import Array, Params
 
+GROUPS = 32
+"""Groups of every group norm in the reference."""
 EPS = 1e-6
 """Added to the variance in the group norms before attention."""
 
@@ -203,19 +204,18 @@ def resnet_leaves(where: str, inside: int, outside: int, time: int = 0) -> Itera
     yield f"{where}/mix", (1,)
 
 
-def attend_leaves(config: SVDUNetConfig, where: str, level: int) -> Iterator[Leaf]:
+def attend_leaves(where: str, width: int, image_dim: int, layers_: int) -> Iterator[Leaf]:
     """Yield the attention of one level of the U-Net."""
-    width = config.widths[level]
     yield from norm_leaves(f"{where}/norm", width)
     yield from linear_leaves(f"{where}/proj_in", width, width)
     yield from mlp_leaves(f"{where}/frame_embed", width, 4 * width, width)
-    for k in range(config.layers[level]):
+    for k in range(layers_):
         for branch in ("spatial", "temporal"):
             there = f"{where}/{branch}_{k}"
             if branch == "temporal":
                 yield from norm_leaves(f"{there}/norm_in", width)
                 yield from _feed_forward_leaves(f"{there}/ff_in", width)
-            for n, dim in ((1, width), (2, config.image_dim)):
+            for n, dim in ((1, width), (2, image_dim)):
                 yield from norm_leaves(f"{there}/norm{n}", width)
                 yield f"{there}/attn{n}/to_q/kernel", (width, width)
                 yield f"{there}/attn{n}/to_k/kernel", (dim, width)

@@ -23,12 +23,13 @@ import jax.numpy as jnp
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config.parts import Backbone, Rules
-from pewm_jax.errors import UserError, require
+from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.clip import model as clip_vision
+from pewm_jax.models.clip.model import CLIPVisionConfig
 from pewm_jax.models.interface import NO_READERS, Conditioning, Observed, Readers
 from pewm_jax.models.svd import layers as svd_layers
-from pewm_jax.models.svd.config import SVDUNetConfig
+from pewm_jax.models.svd.layers import GROUPS
 from pewm_jax.nn import layers, placement
 from pewm_jax.nn.parameters import Leaf, convolution, draw
 from pewm_jax.nn.parameters import mlp as mlp_leaves
@@ -42,10 +43,11 @@ the bottom, on the way down without attention, and in the last norm."""
 
 
 @dataclasses.dataclass(frozen=True)
-class SVDUNetBackbone(SVDUNetConfig, Backbone):
-    """The U-Net of Stable Video Diffusion as the denoiser of a world model.
+class SVDUNetBackbone(Backbone):
+    """A U-Net over space and time in the form of Stable Video Diffusion (arXiv 2311.15127).
 
-    It takes any number of channels: those that codec and control have.
+    As a backbone it takes any number of channels: those that codec and control have. It has no
+    place where a memory could be read. The defaults are as published.
     """
 
     SHARDING: ClassVar[Rules] = (
@@ -55,6 +57,72 @@ class SVDUNetBackbone(SVDUNetConfig, Backbone):
         (r"image/(cls_token|position_embed)", P("fsdp")),
     )
     """Weights are stored split and gathered for use; each device computes its own clips."""
+
+    in_channels: int = 8
+    """Channels of the input: noisy latents and the latents of the image, joined. A world model
+    takes its own number."""
+    out_channels: int = 4
+    """Channels of the prediction. A world model takes its own number."""
+    widths: tuple[int, ...] = (320, 640, 1280, 1280)
+    """Channels of each level; each level but the last halves height and width."""
+    heads: tuple[int, ...] = (5, 10, 20, 20)
+    """Attention heads of each level; the bottom has those of the last level."""
+    attends: tuple[bool, ...] = (True, True, True, False)
+    """Whether a level has attention; the bottom always has."""
+    resnets: tuple[int, ...] = (2, 2, 2, 2)
+    """Residual blocks of each level on the way down; one more on the way up."""
+    layers: tuple[int, ...] = (1, 1, 1, 1)
+    """Transformer layers per attention of each level; the bottom has those of the last level."""
+    image_dim: int = 1024
+    """Channels of the image embedding."""
+    added: int = 3
+    """Scalars besides the noise level: frames per second, motion bucket, noise of the image."""
+    added_dim: int = 256
+    """Channels of the sinusoid of each of these scalars; even."""
+    image: CLIPVisionConfig = CLIPVisionConfig()
+    """The encoder of the image that is attended to; frozen. Its embedding has `image_dim`
+    channels."""
+    fps: float = 7.0
+    """Frames per second in the network's conditioning."""
+    motion_bucket: float = 127.0
+    """The amount of motion in the network's conditioning."""
+    remat: bool = False
+    """Recompute the activations of each residual block and attention in the backward pass: less
+    memory, more work."""
+
+    @property
+    def time_dim(self) -> int:
+        """Channels of the time embedding, to which a modulation is added."""
+        return 4 * self.widths[0]
+
+    def __post_init__(self):
+        """Validate."""
+        require(
+            len(self.widths) > 0, "backbone.widths is empty: name at least one level's channels."
+        )
+        require_positive(self, "backbone", "in_channels", "out_channels", "image_dim", "added")
+        for name in ("heads", "attends", "resnets", "layers"):
+            values = getattr(self, name)
+            require(
+                len(values) == len(self.widths),
+                f"backbone.{name} names {len(values)} levels and backbone.widths "
+                f"{len(self.widths)}: name one value per level.",
+            )
+            require(
+                name == "attends" or min(values) >= 1,
+                f"backbone.{name} holds {min(values)}: use at least 1.",
+            )
+        for width, heads in zip(self.widths, self.heads, strict=True):
+            require(
+                width >= 1 and width % GROUPS == 0 and width % heads == 0,
+                f"backbone.widths holds {width}, which is not a multiple of {GROUPS} groups and of "
+                f"the level's {heads} heads.",
+            )
+        require(
+            self.added_dim >= 2 and self.added_dim % 2 == 0,
+            f"backbone.added_dim is {self.added_dim}: use an even number.",
+        )
+        require(self.fps > 0, f"backbone.fps is {self.fps}: use a number above 0.")
 
     def check(self, model: Any) -> None:
         """Refuse a model that does not fit the network; any size of frames does."""
@@ -146,18 +214,18 @@ class SVDUNetBackbone(SVDUNetConfig, Backbone):
         )
 
 
-def layout(config: SVDUNetConfig) -> dict[str, tuple[int, ...]]:
+def layout(config: SVDUNetBackbone) -> dict[str, tuple[int, ...]]:
     """Return ``{path: shape}`` of the parameters."""
     return dict(_leaves(config))
 
 
-def init(config: SVDUNetConfig, key: Array) -> Params:
+def init(config: SVDUNetBackbone, key: Array) -> Params:
     """Return random parameters, float32; the tree is ``layout``'s."""
     return draw(layout(config), key, key_per_leaf=True)
 
 
 def apply(
-    config: SVDUNetConfig,
+    config: SVDUNetBackbone,
     params: Params,
     latents_BThwC: Array,
     timesteps_B: Array,
@@ -231,14 +299,14 @@ def apply(
     )
 
 
-def _run(config: SVDUNetConfig, layer: Callable[..., Array], *arguments: Array | Params) -> Array:
+def _run(config: SVDUNetBackbone, layer: Callable[..., Array], *arguments: Array | Params) -> Array:
     """Run a layer, with rematerialization if the settings ask for it; each device its own clips."""
     layer = jax.checkpoint(layer) if config.remat else layer
     return placement.constrain(layer(*arguments), "batch")
 
 
 def _time(
-    config: SVDUNetConfig,
+    config: SVDUNetBackbone,
     params: Params,
     dtype: jnp.dtype,
     timesteps_B: Array,
@@ -256,7 +324,7 @@ def _time(
 
 
 def _check(
-    config: SVDUNetConfig,
+    config: SVDUNetBackbone,
     latents: Array,
     timesteps: Array,
     image: Array,
@@ -276,9 +344,14 @@ def _check(
     backbones.require_shape("modulation_BTE", modulation, ((batch, frames, config.time_dim),))
 
 
-def _leaves(config: SVDUNetConfig) -> Iterator[Leaf]:
+def _leaves(config: SVDUNetBackbone) -> Iterator[Leaf]:
     widths, time = config.widths, config.time_dim
     last = len(widths) - 1
+
+    def attend(where: str, level: int) -> Iterator[Leaf]:
+        sizes = widths[level], config.image_dim, config.layers[level]
+        return svd_layers.attend_leaves(where, *sizes)
+
     yield from convolution("conv_in", (3, 3), config.in_channels, widths[0])
     yield from mlp_leaves("time_embed", widths[0], time, time)
     yield from mlp_leaves("added_embed", config.added * config.added_dim, time, time)
@@ -289,14 +362,14 @@ def _leaves(config: SVDUNetConfig) -> Iterator[Leaf]:
         for k in range(config.resnets[level]):
             yield from svd_layers.resnet_leaves(f"{where}/resnet_{k}", inside, width, time)
             if config.attends[level]:
-                yield from svd_layers.attend_leaves(config, f"{where}/attend_{k}", level)
+                yield from attend(f"{where}/attend_{k}", level)
             inside = width
             skips.append(width)
         if level < last:
             yield from convolution(f"{where}/resample", (3, 3), width, width)
             skips.append(width)
     yield from svd_layers.resnet_leaves("mid/resnet_0", inside, inside, time)
-    yield from svd_layers.attend_leaves(config, "mid/attend_0", last)
+    yield from attend("mid/attend_0", last)
     yield from svd_layers.resnet_leaves("mid/resnet_1", inside, inside, time)
     for step, level in enumerate(reversed(range(len(widths)))):
         where, width = f"up_{step}", widths[level]
@@ -305,7 +378,7 @@ def _leaves(config: SVDUNetConfig) -> Iterator[Leaf]:
                 f"{where}/resnet_{k}", inside + skips.pop(), width, time
             )
             if config.attends[level]:
-                yield from svd_layers.attend_leaves(config, f"{where}/attend_{k}", level)
+                yield from attend(f"{where}/attend_{k}", level)
             inside = width
         if level:
             yield from convolution(f"{where}/resample", (3, 3), width, width)

@@ -18,11 +18,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.errors import UserError
+from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models.interface import PublishedVAE
 from pewm_jax.models.svd import layers as svd_layers
-from pewm_jax.models.svd.config import SVDVAEConfig
-from pewm_jax.models.svd.layers import resnet_2d_leaves, resnet_leaves
+from pewm_jax.models.svd.layers import GROUPS, resnet_2d_leaves, resnet_leaves
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import linear
 from pewm_jax.nn.parameters import Leaf, convolution, draw, levels
@@ -36,8 +35,58 @@ EPS, TEMPORAL_EPS = 1e-6, 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
-class SVDVAECodec(SVDVAEConfig, PublishedVAE):
-    """The autoencoder of Stable Video Diffusion; its weights come from a converted checkpoint."""
+class SVDVAECodec(PublishedVAE):
+    """An image encoder and a decoder over space and time (arXiv 2311.15127, appendix D).
+
+    The defaults are as published; the weights come from a converted checkpoint.
+    """
+
+    in_channels: int = 3
+    """Channels of an input frame."""
+    out_channels: int = 3
+    """Channels of an output frame."""
+    latent_channels: int = 4
+    """Channels of a latent."""
+    widths: tuple[int, ...] = (128, 256, 512, 512)
+    """Channels of each level of the encoder; each level but the last halves height and width."""
+    resnets: int = 2
+    """Residual blocks per level of the encoder; the decoder has one more."""
+    scaling_factor: float = 0.18215
+    """Factor that gives latents unit variance for the diffusion model. The latents of the
+    conditioning image stay without it."""
+    depth: bool = True
+    """Whether depth is encoded too, as grey pictures by the same weights, in as many channels more;
+    Stable Video Diffusion itself knows colour alone."""
+
+    @property
+    def spatial(self) -> int:
+        """Pixels per latent cell, along height and along width."""
+        return 2 ** (len(self.widths) - 1)
+
+    @property
+    def temporal(self) -> int:
+        """Frames per latent frame after the first: every frame has its own latents."""
+        return 1
+
+    def __post_init__(self):
+        """Validate."""
+        require(len(self.widths) > 0, "codec.widths is empty: name at least one level's channels.")
+        require_positive(self, "codec", "in_channels", "out_channels", "latent_channels")
+        require(
+            self.resnets >= 2,
+            f"codec.resnets is {self.resnets}: use at least 2, or the decoder's bottom has no "
+            "attention.",
+        )
+        for width in self.widths:
+            require(
+                width >= 1 and width % GROUPS == 0,
+                f"codec.widths holds {width}, which is not a multiple of {GROUPS} groups.",
+            )
+        require(
+            self.scaling_factor > 0,
+            f"codec.scaling_factor is {self.scaling_factor}: use the checkpoint's positive factor "
+            "(0.18215).",
+        )
 
     @property
     def framewise(self) -> bool:
@@ -58,17 +107,17 @@ class SVDVAECodec(SVDVAEConfig, PublishedVAE):
         return decode(self, params, latents_BthwC / self.scaling_factor)
 
 
-def layout(config: SVDVAEConfig) -> dict[str, tuple[int, ...]]:
+def layout(config: SVDVAECodec) -> dict[str, tuple[int, ...]]:
     """Return ``{path: shape}`` of the parameters; see ``svd.layers``."""
     return dict([*_encoder(config), *_decoder(config)])
 
 
-def init(config: SVDVAEConfig, key: Array) -> Params:
+def init(config: SVDVAECodec, key: Array) -> Params:
     """Return random parameters, float32: ``{"encoder": …, "decoder": …}``."""
     return draw(layout(config), key, key_per_leaf=True)
 
 
-def encode(config: SVDVAEConfig, params: Params, video_BTHWC: Array) -> Array:
+def encode(config: SVDVAECodec, params: Params, video_BTHWC: Array) -> Array:
     """Encode every frame to the mean of its latents, which is the distribution's mode.
 
     Args:
@@ -93,7 +142,7 @@ def encode(config: SVDVAEConfig, params: Params, video_BTHWC: Array) -> Array:
 
 
 def decode(
-    config: SVDVAEConfig, params: Params, latents_BThwC: Array, *, at_once: int | None = None
+    config: SVDVAECodec, params: Params, latents_BThwC: Array, *, at_once: int | None = None
 ) -> Array:
     """Decode latents to a video.
 
@@ -119,7 +168,7 @@ def decode(
 
 
 @partial(jax.jit, static_argnums=0)
-def _encode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
+def _encode(config: SVDVAECodec, params: Params, x: Array) -> Array:
     x = convolve_frames(params["conv_in"], x, 1, SAME)
     for level in range(len(config.widths)):
         place = params[f"down_{level}"]
@@ -137,7 +186,7 @@ def _encode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
 
 
 @partial(jax.jit, static_argnums=0)
-def _decode(config: SVDVAEConfig, params: Params, x: Array) -> Array:
+def _decode(config: SVDVAECodec, params: Params, x: Array) -> Array:
     mix = partial(svd_layers.resnet, eps=EPS, temporal_eps=TEMPORAL_EPS, switched=True)
     x = convolve_frames(params["conv_in"], x, 1, SAME)
     place = params["mid"]
@@ -163,7 +212,7 @@ def _attend(params: Params, x_BTHWC: Array) -> Array:
     return x_BTHWC + multi_head_attention(params, x, x, 1).reshape(x_BTHWC.shape)
 
 
-def _encoder(config: SVDVAEConfig) -> Iterator[Leaf]:
+def _encoder(config: SVDVAECodec) -> Iterator[Leaf]:
     widths, moments = config.widths, 2 * config.latent_channels
     yield from convolution("encoder/conv_in", (3, 3), config.in_channels, widths[0])
     yield from levels("encoder/down", widths, config.resnets, resnet_2d_leaves)
@@ -175,7 +224,7 @@ def _encoder(config: SVDVAEConfig) -> Iterator[Leaf]:
     yield from linear_leaves("encoder/quant", moments, moments)
 
 
-def _decoder(config: SVDVAEConfig) -> Iterator[Leaf]:
+def _decoder(config: SVDVAECodec) -> Iterator[Leaf]:
     widths = config.widths[::-1]
     yield from convolution("decoder/conv_in", (3, 3), config.latent_channels, widths[0])
     for k in range(config.resnets):

@@ -23,8 +23,7 @@ from pewm_jax.io.published import (
     rename,
 )
 from pewm_jax.models.wan import vae
-from pewm_jax.models.wan.config import MEAN_16, STD_16
-from pewm_jax.models.wan.vae import WanVAECodec
+from pewm_jax.models.wan.vae import MEAN_16, STD_16, WanVAECodec
 
 CLASS = "AutoencoderKLWan"
 """The reference's class."""

@@ -18,14 +18,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.errors import UserError, require
+from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models.interface import PublishedVAE
-from pewm_jax.models.wan.config import WanVAEConfig
 from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import video_convolution as convolutions
 from pewm_jax.nn.layers import linear
@@ -42,13 +41,96 @@ from pewm_jax.types import Array, Params
 
 LOGVAR_RANGE = (-30.0, 20.0)
 """The logarithm of a latent's variance is clipped to this range."""
+MEAN_16 = (
+    *(-0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508),
+    *(0.4134, -0.0715, 0.5517, -0.3632, -0.1922, -0.9497, 0.2503, -0.2921),
+)
+STD_16 = (
+    *(2.8184, 1.4541, 2.3275, 2.6558, 1.2196, 1.7708, 2.6052, 2.0743),
+    *(3.2687, 2.1526, 2.8652, 1.5579, 1.6382, 1.1253, 2.8251, 1.9160),
+)
 SMALLEST = 1e-12
 """Least length that a pixel's channels are divided by."""
 
 
 @dataclasses.dataclass(frozen=True)
-class WanVAECodec(WanVAEConfig, PublishedVAE):
-    """Wan's video autoencoder; its weights come from a converted checkpoint."""
+class WanVAECodec(PublishedVAE):
+    """Wan 2.1's video autoencoder (arXiv 2503.20314): causal, four frames to a latent.
+
+    Cosmos-Predict2 uses it. The defaults are as published; the weights come from a converted
+    checkpoint.
+    """
+
+    in_channels: int = 3
+    """Channels of an input frame."""
+    out_channels: int = 3
+    """Channels of an output frame."""
+    latent_channels: int = 16
+    """Channels of a latent."""
+    base_width: int = 96
+    """Channels of the encoder's first layer."""
+    decoder_base_width: int = 96
+    """The same for the decoder's last one."""
+    multiples: tuple[int, ...] = (1, 2, 4, 4)
+    """Channels of each level over the base; each level but the last halves height and width."""
+    resnets: int = 2
+    """Residual blocks per level of the encoder; the decoder has one more."""
+    halves_time: tuple[bool, ...] = (False, True, True)
+    """Whether a level of the encoder, but the last, halves the number of frames too."""
+    latents_mean: tuple[float, ...] = MEAN_16
+    """Mean of each channel of latents, by which the diffusion model's latents are shifted."""
+    latents_std: tuple[float, ...] = STD_16
+    """Standard deviation of each channel. Neither encoding nor decoding uses the two;
+    ``normalise`` and ``restore`` do."""
+    convolution: Literal["auto", "taps", "volume", "winograd"] = "auto"
+    """The form of 3D convolutions, as in ``VAEConfig``."""
+    depth: bool = True
+    """Whether depth is encoded too, as grey pictures by the same weights, in as many channels more;
+    Cosmos-Predict2 itself knows colour alone."""
+
+    @property
+    def spatial(self) -> int:
+        """Pixels per latent cell, along height and along width."""
+        return 2 ** len(self.halves_time)
+
+    @property
+    def temporal(self) -> int:
+        """Frames per latent after the first."""
+        return 2 ** sum(self.halves_time)
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "codec", "in_channels", "out_channels", "latent_channels", "resnets")
+        require_positive(self, "codec", "base_width", "decoder_base_width")
+        require(
+            len(self.multiples) > 0 and min(self.multiples) >= 1,
+            f"codec.multiples is {self.multiples}: name one number of at least 1 per level.",
+        )
+        require(
+            len(self.halves_time) == len(self.multiples) - 1,
+            f"codec.halves_time names {len(self.halves_time)} levels: name one value for each of "
+            f"the {len(self.multiples)} levels but the last.",
+        )
+        require(
+            self.temporal <= 4,
+            f"codec.halves_time halves time {sum(self.halves_time)} times: at most twice, the "
+            "reference reads four frames at a time.",
+        )
+        require(
+            all(self.decoder_base_width * m % 2 == 0 for m in self.multiples[1:]),
+            f"codec.decoder_base_width {self.decoder_base_width} times codec.multiples must be "
+            "even numbers: each step up halves the channels.",
+        )
+        for name in ("latents_mean", "latents_std"):
+            require(
+                len(getattr(self, name)) == self.latent_channels,
+                f"codec.{name} names {len(getattr(self, name))} channels: name one number for each "
+                f"of the {self.latent_channels} of codec.latent_channels.",
+            )
+        require(
+            min(self.latents_std) > 0,
+            f"codec.latents_std holds {min(self.latents_std)}: use numbers above 0.",
+        )
 
     @property
     def framewise(self) -> bool:
@@ -79,7 +161,7 @@ class WanVAECodec(WanVAEConfig, PublishedVAE):
         return decode(self, params, restore(self, latents_BthwC))
 
 
-def layout(config: WanVAEConfig) -> dict[str, tuple[int, ...]]:
+def layout(config: WanVAECodec) -> dict[str, tuple[int, ...]]:
     """Return ``{path: shape}`` of the parameters.
 
     A 3D convolution is ``kernel (3, 3, 3, in, out)`` and ``bias``, one of frames ``(3, 3, in,
@@ -88,28 +170,28 @@ def layout(config: WanVAEConfig) -> dict[str, tuple[int, ...]]:
     return dict([*_encoder(config), *_decoder(config)])
 
 
-def init(config: WanVAEConfig, key: Array) -> Params:
+def init(config: WanVAECodec, key: Array) -> Params:
     """Return random parameters, float32: ``{"encoder": …, "decoder": …}``."""
     return draw(layout(config), key, key_per_leaf=True)
 
 
-def normalise(config: WanVAEConfig, latents_BthwC: Array) -> Array:
+def normalise(config: WanVAECodec, latents_BthwC: Array) -> Array:
     """Return latents of mean 0 and deviation 1 in each channel, as the diffusion model has them."""
     mean, std = _statistics(config, latents_BthwC.dtype)
     return (latents_BthwC - mean) / std
 
 
-def restore(config: WanVAEConfig, latents_BthwC: Array) -> Array:
+def restore(config: WanVAECodec, latents_BthwC: Array) -> Array:
     """Invert ``normalise``."""
     mean, std = _statistics(config, latents_BthwC.dtype)
     return latents_BthwC * std + mean
 
 
-def _statistics(config: WanVAEConfig, dtype: jnp.dtype) -> tuple[Array, Array]:
+def _statistics(config: WanVAECodec, dtype: jnp.dtype) -> tuple[Array, Array]:
     return jnp.asarray(config.latents_mean, dtype), jnp.asarray(config.latents_std, dtype)
 
 
-def encode(config: WanVAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
+def encode(config: WanVAECodec, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
     """Encode a video to the mean and variance of its latents.
 
     To sample, compute mean + exp(logvar / 2)·noise.
@@ -141,7 +223,7 @@ def encode(config: WanVAEConfig, params: Params, video_BTHWC: Array) -> tuple[Ar
     return mean, jnp.clip(logvar, *LOGVAR_RANGE)
 
 
-def decode(config: WanVAEConfig, params: Params, latents_BthwC: Array) -> Array:
+def decode(config: WanVAECodec, params: Params, latents_BthwC: Array) -> Array:
     """Decode latents (B, t, h, w, z), not normalised, in the dtype of the computation.
 
     Returns:
@@ -157,7 +239,7 @@ def decode(config: WanVAEConfig, params: Params, latents_BthwC: Array) -> Array:
 
 @partial(jax.jit, static_argnums=0)
 def _encode_chunk(
-    config: WanVAEConfig, params: Params, x: Array, past: Params
+    config: WanVAECodec, params: Params, x: Array, past: Params
 ) -> tuple[Array, Params]:
     new: dict[str, Any] = {}
     x, new["conv_in"] = causal_conv(config, params["conv_in"], x, past.get("conv_in"))
@@ -172,7 +254,7 @@ def _encode_chunk(
 
 @partial(jax.jit, static_argnums=0)
 def _decode_chunk(
-    config: WanVAEConfig, params: Params, x: Array, past: Params
+    config: WanVAECodec, params: Params, x: Array, past: Params
 ) -> tuple[Array, Params]:
     new: dict[str, Any] = {}
     x = linear(params["quant"], x)
@@ -187,7 +269,7 @@ def _decode_chunk(
 
 
 def _level(
-    config: WanVAEConfig, params: Params, x: Array, past: Params, resample: Any
+    config: WanVAECodec, params: Params, x: Array, past: Params, resample: Any
 ) -> tuple[Array, Params]:
     """Run the residual blocks of a level, and change the size after them."""
     new: dict[str, Any] = {}
@@ -212,7 +294,7 @@ def active(params: Params, x: Array) -> Array:
 
 
 def causal_conv(
-    config: WanVAEConfig, params: Params, x_BTHWC: Array, past: Array | None
+    config: WanVAECodec, params: Params, x_BTHWC: Array, past: Array | None
 ) -> tuple[Array, Array]:
     """Convolve causally; before the first chunk (``past`` None) there are two frames of zeros."""
     past = _two_zeros(x_BTHWC) if past is None else past
@@ -220,7 +302,7 @@ def causal_conv(
 
 
 def resnet(
-    config: WanVAEConfig, params: Params, x_BTHWC: Array, past: Params
+    config: WanVAECodec, params: Params, x_BTHWC: Array, past: Params
 ) -> tuple[Array, Params]:
     """Residual block: norm, SiLU, convolution, twice; with the next chunk's past."""
     h, new = x_BTHWC, {}
@@ -234,7 +316,7 @@ def resnet(
 
 
 def middle(
-    config: WanVAEConfig, params: Params, x_BTHWC: Array, past: Params
+    config: WanVAECodec, params: Params, x_BTHWC: Array, past: Params
 ) -> tuple[Array, Params]:
     """Run the bottom: residual block, attention within each frame, residual block."""
     new = {}
@@ -308,7 +390,7 @@ def _two_zeros(x_BTHWC: Array) -> Array:
     return jnp.zeros((batch, 2, *rest), x_BTHWC.dtype)
 
 
-def _encoder(config: WanVAEConfig) -> Iterator[Leaf]:
+def _encoder(config: WanVAECodec) -> Iterator[Leaf]:
     inside, moments = config.base_width, 2 * config.latent_channels
     yield from convolution("encoder/conv_in", (3, 3, 3), config.in_channels, inside)
     for level, multiple in enumerate(config.multiples):
@@ -326,7 +408,7 @@ def _encoder(config: WanVAEConfig) -> Iterator[Leaf]:
     yield from linear_leaves("encoder/quant", moments, moments)
 
 
-def _decoder(config: WanVAEConfig) -> Iterator[Leaf]:
+def _decoder(config: WanVAECodec) -> Iterator[Leaf]:
     widths = [multiple * config.decoder_base_width for multiple in config.multiples[::-1]]
     inside, latent = widths[0], config.latent_channels
     yield from linear_leaves("decoder/quant", latent, latent)

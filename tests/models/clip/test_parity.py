@@ -14,9 +14,9 @@ from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWi
 
 from pewm_jax.config import UserError
 from pewm_jax.convert import pipeline, svd
-from pewm_jax.models.clip import config as clip_config
 from pewm_jax.models.clip import convert as clip_convert
 from pewm_jax.models.clip import model
+from pewm_jax.models.clip import model as clip_config
 from tests.models.svd.references import distance, draw, randomise
 
 
