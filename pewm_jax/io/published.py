@@ -181,26 +181,10 @@ TRANSFORMERS_METADATA = (
 
 
 def rename(path: str, rules: Sequence[tuple[str, Any]]) -> str:
-    """Apply regular expressions to a path, in sequence."""
-    for pattern, name in rules:
+    """Return the published name of a path: apply regular expressions, then torch's conventions."""
+    for pattern, name in (*rules, (r"/(kernel|scale)$", "/weight"), (r"[/.]+", ".")):
         path = re.sub(pattern, name, path)
     return path
-
-
-def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
-    """Raise an error if settings name another class.
-
-    Args:
-        values: the JSON object.
-        what: what they describe, for the message: ``The U-Net``.
-        name: the supported class.
-
-    Raises:
-        UserError: they name another class. Naming none is allowed.
-    """
-    kind = values.get("_class_name", name)
-    if kind != name:
-        raise UserError(f"{what} is a {kind}; only {name} can be read.")
 
 
 def require_known(values: Mapping[str, Any], what: str, known: Collection[str]) -> None:
@@ -224,19 +208,19 @@ def read_settings(
     defaults: Mapping[str, Any],
     without_effect: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Return the settings of a network of one class, with the class's defaults for missing ones.
+    """Return the settings of a network of class ``name``, with the class's defaults.
 
     Args:
         values: the JSON object.
-        what: what they describe, for messages.
-        name: the supported class.
+        what: what they describe, for messages: ``The U-Net``.
         defaults: the settings that matter, with the class's defaults.
         without_effect: settings that are allowed and ignored.
 
     Raises:
-        UserError: another class, or an unknown setting.
+        UserError: another class, or an unknown setting. Naming no class is allowed.
     """
-    require_class(values, what, name)
+    if (kind := values.get("_class_name", name)) != name:
+        raise UserError(f"{what} is a {kind}; only {name} can be read.")
     require_known(values, what, {*defaults, *without_effect})
     return {key: values.get(key, default) for key, default in defaults.items()}
 

@@ -83,14 +83,9 @@ NO_READERS = Readers()
 def observed(model: AssembledModel, params: Params, seen: Observed) -> Conditioning:
     """Turn the observed frames into inputs of the backbone, by its own ways if it has any.
 
-    By default the latents are joined to the input, zero for the frames to be imagined.
-
-    Args:
-        params: the world model's parameters; those under ``image`` are the backbone's to use.
-
-    Returns:
-        Conditioning with ``settings.shown_channels(model)`` joined channels: by default as many as
-        the latents have.
+    By default the latents are joined to the input, zero for the frames to be imagined. There are
+    ``settings.shown_channels(model)`` joined channels. ``params`` are the world model's; those
+    under ``image`` are the backbone's to use.
     """
     own = model.backbone.observed(model, params, seen)
     if own is not None:

@@ -243,16 +243,9 @@ def _forward(q: Array, k: Array, v: Array, blocks: int) -> tuple[Array, tuple[Ar
 def _backward(blocks: int, saved: tuple[Array, ...], grad: Array) -> Any:
     q, k, v, out, normaliser = saved
     shared = (grad.astype(jnp.float32) * out.astype(jnp.float32)).sum(-1, keepdims=True)
-    return jax.lax.platform_dependent(
-        q,
-        k,
-        v,
-        normaliser,
-        shared,
-        grad,
-        cpu=partial(_pieces_backward, blocks=blocks),
-        default=_piece_backward,
-    )
+    arrays = q, k, v, normaliser, shared, grad
+    by_blocks = partial(_pieces_backward, blocks=blocks)
+    return jax.lax.platform_dependent(*arrays, cpu=by_blocks, default=_piece_backward)
 
 
 _attention.defvjp(_forward, _backward)

@@ -28,16 +28,8 @@ from pewm_jax.types import Array
 def patchify(latents_BthwC: Array, patch: int, patch_t: int = 1) -> Array:
     """(B, t, h, w, C) → (B, t/p_t·h/p·w/p, C·p_t·p·p), channels before the patch's cells."""
     batch, frames, height, width, channels = latents_BthwC.shape
-    grid = latents_BthwC.reshape(
-        batch,
-        frames // patch_t,
-        patch_t,
-        height // patch,
-        patch,
-        width // patch,
-        patch,
-        channels,
-    )
+    t, h, w = frames // patch_t, height // patch, width // patch
+    grid = latents_BthwC.reshape(batch, t, patch_t, h, patch, w, patch, channels)
     cells = channels * patch_t * patch * patch
     return grid.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(batch, -1, cells)
 
@@ -47,16 +39,8 @@ def unpatchify(
 ) -> Array:
     """Invert ``patchify`` to (B, frames, height, width, C); sizes are the latents'."""
     batch = tokens_BNC.shape[0]
-    grid = tokens_BNC.reshape(
-        batch,
-        frames // patch_t,
-        height // patch,
-        width // patch,
-        -1,
-        patch_t,
-        patch,
-        patch,
-    )
+    t, h, w = frames // patch_t, height // patch, width // patch
+    grid = tokens_BNC.reshape(batch, t, h, w, -1, patch_t, patch, patch)
     return grid.transpose(0, 1, 5, 2, 6, 3, 7, 4).reshape(batch, frames, height, width, -1)
 
 

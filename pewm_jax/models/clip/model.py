@@ -92,15 +92,10 @@ def init(config: CLIPVisionConfig, key: Array) -> Params:
 
 
 def apply(config: CLIPVisionConfig, params: Params, images_BHWC: Array) -> Array:
-    """Return the projected embedding of every image.
+    """Return the projected embedding of every image, (B, projection), not of unit length.
 
-    Args:
-        images_BHWC: (B, image_size, image_size, 3) floats, already normalised (see
-            ``preprocess``). Their dtype is the dtype of the computation; norms and softmax are in
-            float32.
-
-    Returns:
-        (B, projection) in the images' dtype, not normalised to unit length.
+    The images are floats from ``preprocess``. Their dtype is the dtype of the computation; norms
+    and softmax are in float32.
 
     Raises:
         UserError: images of another shape or dtype.
@@ -129,13 +124,7 @@ def preprocess(rgb_BHWC: Array, size: int = 224) -> Array:
 
     Resizing is that of the pipeline of Stable Video Diffusion in diffusers: a Gaussian blur whose
     width follows from the factor, then bicubic interpolation with aligned corners. Along each axis
-    both are one matrix.
-
-    Args:
-        rgb_BHWC: (B, H, W, 3) floats in [−1, 1], at least 2 × 2 pixels.
-
-    Returns:
-        (B, size, size, 3) in the dtype of the colours.
+    both are one matrix. The dtype is that of the colours.
 
     Raises:
         UserError: no RGB images, or too small ones.

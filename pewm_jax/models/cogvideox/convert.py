@@ -265,8 +265,6 @@ def _vae_name(path: str) -> str:
         (r"scale_by/", "conv_y.conv/"),
         (r"shift_by/", "conv_b.conv/"),
         (r"(conv\d|conv_in|conv_out)/", r"\1.conv/"),
-        (r"/(kernel|scale)$", "/weight"),
-        (r"/", "."),
     )
     return rename(path, rules)
 

@@ -4,18 +4,12 @@ Four frames of 8 × 8 pixels become one latent; the first frame has a latent of 
 encoded in chunks of 8 frames (the first chunk also takes the remainder) and decoded in chunks of 2
 latents (3 in the first chunk if their number is odd). Every convolution passes its last two frames
 on to the next chunk, but the group norms see one chunk at a time. The chunks therefore affect the
-result, and they bound the memory. A latent depends on later frames only through the statistics of
-the norms, which cover its own chunk.
-
-Outside of ``jit``, ``encode`` and ``decode`` call a compiled function per chunk, so two
-compilations serve videos of any length.
+result, and they bound the memory. Outside of ``jit``, a compiled function is called per chunk, so
+two compilations serve videos of any length.
 
 8N + 1 frames become 2N + 1 latents and 8N + 1 frames again. An *even* number of latents has no
-first-frame rule: 2 latents decode to 8 frames, not 5. See ``frames_of`` and ``latents_of``.
-
-Large frames may be processed in overlapping spatial tiles, which are blended (``in_tiles``). Tiles
-need less memory than whole frames. The result differs slightly, since norms and borders see only a
-tile. Tiles of equal shape share one compiled body and run one after another.
+first-frame rule: 2 latents decode to 8 frames, not 5. Large frames may be processed in overlapping
+spatial tiles, which are blended (``in_tiles``), with less memory and a slightly different result.
 
 Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``; ``VAECodec`` does, a codec of
 the mean of the latents. Reference: ``AutoencoderKLCogVideoX`` of diffusers.
@@ -113,17 +107,12 @@ def latents_of(config: VAEConfig, frames: int) -> int:
 
 
 def encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
-    """Encode a video to the mean and variance of its latents.
+    """Encode a video to mean and logarithm of the variance of its latents, (B, t, H/8, W/8, z).
 
-    To sample, compute mean + exp(logvar / 2)·noise.
-
-    Args:
-        video_BTHWC: (B, T, H, W, C) floats in [−1, 1]; their dtype is that of the computation.
-            T is 8N + 1, or another number that ``latents_of`` accepts. H and W are multiples
-            of ``config.spatial``; excess rows and columns are lost, as in the reference.
-
-    Returns:
-        Mean and logarithm of the variance, each (B, t, H/8, W/8, z), not scaled.
+    They are not scaled. To sample, compute mean + exp(logvar / 2)·noise. The video is of floats in
+    [−1, 1], whose dtype is that of the computation; T is 8N + 1, or another number that
+    ``latents_of`` accepts. Rows and columns beyond a multiple of ``config.spatial`` are lost, as in
+    the reference.
 
     Raises:
         UserError: frames that cannot be encoded.
@@ -161,21 +150,16 @@ def encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array
 def decode(
     config: VAEConfig, params: Params, latents_BthwC: Array, *, frames: int | None = None
 ) -> Array:
-    """Decode latents to a video.
+    """Decode latents (B, t, h, w, z) to (B, ``frames_of(config, t)``, 8h, 8w, C), in about [−1, 1].
+
+    The latents are divided by ``config.scaling_factor`` again; their dtype is that of the
+    computation. If the number of expected ``frames`` is not given, an even number of latents warns.
 
     Memory does not grow with the length of the clip, since two latents are decoded at a time. With
     the published widths, 49 frames of 480 × 720 in float32 need 20.8 GiB besides parameters and
     video, by XLA's memory analysis on a CPU (``python benchmarks/cogvideox_vae.py --memory``). It
     is proportional to the pixels of a frame: with ``config.tiling``, tiles of 240 × 360 need about
     a quarter.
-
-    Args:
-        latents_BthwC: (B, t, h, w, z) latents, divided by ``config.scaling_factor`` again; their
-            dtype is that of the computation.
-        frames: the number of frames expected; if not given, an even number of latents warns.
-
-    Returns:
-        (B, T, 8h, 8w, C) video in about [−1, 1]; T = ``frames_of(config, t)``.
 
     Raises:
         UserError: the latents decode to another number of frames than expected.
@@ -260,15 +244,9 @@ def in_tiles(
 ) -> Array:
     """Apply ``whole`` to the tiles of a video and blend, or to a video no larger than a tile.
 
-    Args:
-        whole: (B, T, H, W, C) → (B, T', H', W', C').
-        x_BTHWC: the video, or the latents.
-        config: the autoencoder; without ``config.tiling`` the video is not split.
-        shrink: whether ``whole`` encodes (pixels in, latents out) or decodes.
-
-    Returns:
-        What ``whole`` would return, up to effects at tile borders. If tiles do not overlap by a
-        whole number of latents, the size differs, as in the reference, and a warning is logged.
+    ``whole`` encodes (``shrink``: pixels in, latents out) or decodes. The result is that of the
+    whole video up to effects at tile borders. If tiles do not overlap by a whole number of latents,
+    its size differs, as in the reference, and a warning is logged.
     """
     pixels = config.tile_pixels
     latents = tuple(size // config.spatial for size in pixels)

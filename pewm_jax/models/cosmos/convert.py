@@ -58,8 +58,6 @@ _RULES = (
     (r"to_out/", "to_out.0/"),
     (r"ff/up/", "ff.net.0.proj/"),
     (r"ff/down/", "ff.net.2/"),
-    (r"/(kernel|scale)$", "/weight"),
-    (r"/", "."),
 )
 
 

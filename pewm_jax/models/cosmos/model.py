@@ -144,11 +144,11 @@ def apply(
     memory_params: Any = None,
     added_BND: Array | None = None,
 ) -> Array:
-    """Predict from noisy latents.
+    """Predict from noisy latents: (B, t, h, w, out_channels) in their dtype.
 
     Args:
-        latents_BthwC: (B, t, h, w, C) noisy latents, scaled; h and w are multiples of the patch, t
-            of ``patch_t``. Their dtype is the dtype of the computation.
+        latents_BthwC: scaled; h and w are multiples of the patch, t of ``patch_t``. Their dtype is
+            that of the computation.
         timesteps_Bt: (B,) noise level in the network's units, σ / (1 + σ); or (B, t'), one for
             each of the t' = t / ``patch_t`` tokens in time.
         text_BLD: (B, L, D) text tokens.
@@ -157,13 +157,11 @@ def apply(
         padding_BHWC: (B or 1, H, W, 1) 1 where a pixel is padding, of any size; None for none.
         fps: frames per second, one number; None for an image, and to count frames.
         modulation_BtE: (B, t', width) added to the time embedding of each token in time, from
-            which every block and the output layer compute their modulation; None for none.
+            which every block and the output layer compute their modulation.
         memory_block: function of the video tokens that runs after every block and reads the
             memory; tokens are in the order of ``layout_of``.
+        memory_params: its parameters, stacked over layers.
         added_BND: (B, N, D) added to the embedded tokens, in the order of ``layout_of``.
-
-    Returns:
-        (B, t, h, w, out_channels) prediction in the latents' dtype.
 
     Raises:
         UserError: an argument of another shape, or a size beyond the positions.

@@ -163,17 +163,11 @@ def init(config: DINOv2Config, key: Array) -> Params:
 
 
 def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
-    """Return the patch tokens after the final layer norm.
+    """Return the patch tokens after the final layer norm, (B, H/p, W/p, D) in the images' dtype.
 
-    Images are independent, so a batch that is sharded over devices stays sharded.
-
-    Args:
-        images_BHWC: (B, H, W, 3) floats, already normalised (see ``preprocess``); H and W are
-            multiples of the patch. Their dtype is the dtype of the computation; norms and softmax
-            are in float32.
-
-    Returns:
-        (B, H/p, W/p, D) in the images' dtype.
+    Images are independent, so a batch that is sharded over devices stays sharded. The images are
+    floats from ``preprocess``; H and W are multiples of the patch. Their dtype is the dtype of the
+    computation; norms and softmax are in float32.
 
     Raises:
         UserError: a size is not a multiple of the patch, or the array is not of RGB floats.
@@ -233,10 +227,7 @@ def _blocks(config: DINOv2Config, blocks: Params, tokens_BND: Array) -> Array:
 
 
 def load(folder: Path) -> tuple[DINOv2Config, Params]:
-    """Read a folder made by ``pewm-jax convert import dinov2``.
-
-    Returns:
-        The configuration and NumPy parameters in the stored dtype.
+    """Read a folder made by ``pewm-jax convert import dinov2``: configuration and NumPy parameters.
 
     Raises:
         UserError: a file is absent or damaged, or the weights do not fit the configuration.
@@ -256,16 +247,9 @@ def load(folder: Path) -> tuple[DINOv2Config, Params]:
 def preprocess(rgb_BHWC: Array, size: int | tuple[int, int], patch: int = 14) -> Array:
     """Turn colours in [−1, 1] into the encoder's input: resized, then normalised as ImageNet.
 
-    Resizing is bicubic with antialiasing, as in the published models' image processor. Nothing is
-    cropped, so every pixel of the camera has features.
-
-    Args:
-        rgb_BHWC: (B, H, W, 3) floats in [−1, 1].
-        size: the new size in pixels, one number or (height, width), multiples of the patch; 518
-            gives 37×37 patches.
-
-    Returns:
-        (B, *size, 3) in the dtype of the colours.
+    ``size`` in pixels is one number or (height, width), multiples of the patch; 518 gives 37×37
+    patches. Resizing is bicubic with antialiasing, as in the published models' image processor.
+    Nothing is cropped, so every pixel of the camera has features.
 
     Raises:
         UserError: a size that is not a multiple of the patch.

@@ -13,7 +13,6 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from pewm_jax.errors import UserError
@@ -43,15 +42,11 @@ TRANSPOSED = Transform(
 
 
 def read(path: str | Path, config: NomadConfig | None = None) -> tuple[NomadConfig, Params]:
-    """Read a file of weights.
-
-    Args:
-        path: a file of ``torch.save``, or safetensors with the same names.
-        config: its sizes, by default the published ones; the number of earlier pictures is taken
-            from the file.
+    """Read a file of ``torch.save``, or safetensors with the same names.
 
     Returns:
-        ``(config, params)`` as ``models.nomad`` takes them, float32.
+        ``(config, params)`` as ``models.nomad`` takes them, float32. The sizes are the given ones,
+        by default the published; the number of earlier pictures is taken from the file.
 
     Raises:
         UserError: the file is absent or damaged, or holds other tensors or sizes.
@@ -77,13 +72,8 @@ def read(path: str | Path, config: NomadConfig | None = None) -> tuple[NomadConf
                 f"{path}, weights of NoMaD, {what} {tree.listing(names)}: give all tensors of its "
                 "state_dict and no others, and the sizes it was trained with."
             )
-    turned = {
-        entry.path: np.ascontiguousarray(_turned(entry, found[entry.name]), np.float32)
-        for entry in listed
-    }
-    params = tree.unflatten(turned)
-    like = {name: jax.ShapeDtypeStruct(s, np.float32) for name, s in nomad.shapes(config).items()}
-    weights.check(params, tree.unflatten(like), f"{path}, weights of NoMaD,")
+    turned = {entry.path: _turned(entry, found[entry.name]) for entry in listed}
+    params = weights.require_shapes(turned, nomad.shapes(config), f"{path}, weights of NoMaD,")
     return config, params
 
 

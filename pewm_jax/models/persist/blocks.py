@@ -154,19 +154,14 @@ def run(
     known_BTN: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Run all blocks.
+    """Run all blocks on T frames; also return the cache that includes them, if there is one.
 
     Args:
-        params: their parameters, stacked over layers.
-        x_BTND: (B, T, N, D) tokens of T frames, those after the cache's; their dtype is the dtype
-            of the computation.
+        x_BTND: tokens of the frames after the cache's; their dtype is that of the computation.
         condition_BTD: each frame's condition, from which its modulation is made.
-        context_BTMD: (B, T, M, D) the tokens that ``cross`` attends to, each frame to its own.
+        context_BTMD: the tokens that ``cross`` attends to, each frame to its own.
         known_BTN: bool, which tokens later frames may read; None for all.
         cache: the frames before; None if there are none and none are kept.
-
-    Returns:
-        ``(x_BTND, cache)``: the updated tokens, and the cache including these frames, or None.
     """
     frames = x_BTND.shape[1]
     past = 0 if cache is None else config.context - 1
@@ -225,9 +220,7 @@ def norm(x: Array) -> Array:
 def times_of(config: BlocksConfig, first: Array, frames: int, past: int) -> tuple[Array, Array]:
     """Return rotary angles (T, head_dim/2) of frames, and the attention mask over past and present.
 
-    Args:
-        first: () number of the first of the frames.
-        past: slots of the frames before, of which the last one is frame ``first`` − 1.
+    ``first`` is the number of the first frame; the last of the ``past`` slots is the one before.
     """
     half = config.head_dim // 2
     frequency = np.float32(1e4) ** (-np.arange(half, dtype=np.float32) / half)

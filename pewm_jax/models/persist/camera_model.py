@@ -77,16 +77,13 @@ def apply(
     dtype: Any = jnp.float32,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict the step to each frame's camera.
+    """Predict the steps (B, T, 6) to each frame's camera, metres and radians, with the cache.
 
     Args:
-        classes_BTXYZ: (B, T, X, Y, Z) class ids of the frame that the action leads to; the grid or
-            its innermost part.
-        camera_BTN: (B, T, 10) numbers of the camera before the action; see ``camera_numbers``.
-        actions_BTA: (B, T, A) the action that leads to each frame.
-
-    Returns:
-        ``(steps_BT6, cache)``: metres and radians, float32; the cache with these frames, or None.
+        classes_BTXYZ: class ids of the frame that the action leads to; the grid or its innermost
+            part.
+        camera_BTN: numbers of the camera before the action; see ``camera_numbers``.
+        actions_BTA: the action that leads to each frame.
 
     Raises:
         UserError: an argument of another shape.

@@ -69,21 +69,20 @@ def apply(
     known_BTxyz: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict the target of the noise from noisy frames.
+    """Predict the target of the noise from noisy frames, with the cache that has these frames.
 
-    Args: config: the network. params: its parameters. latents_BTxyzC: (B, T, side, side, side, C)
-        noisy latents of T frames; their dtype is the dtype of the computation. times_BT: each
-        frame's time, in the network's units. actions_BTA: the action that leads *to* each frame;
-        zeros for the first frame of an episode. pixels_BThwC: latents of each frame's image: of the
-        frame before it, or for the first frame of an episode its own. Further channels, such as
-        rays, may be appended. camera_BTN: numbers of that image's camera; see
-        ``geometry.actions.camera_numbers``. shown_BT: bool, whether a frame has its image; None
-        means all have. known_BTxyz: bool, which latents are known; tokens of others are not read by
-        later frames. None means all are. cache: the frames before these; see ``frame_blocks``.
+    All denoising steps of a frame use the cache from before it; the cache for the next frame is
+    computed from the denoised frame. The dtype of the latents is that of the computation.
 
-    Returns: ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with
-        these frames, or None. All denoising steps of a frame use the cache from before it; the
-        cache for the next frame is computed from the denoised frame.
+    Args:
+        times_BT: each frame's time, in the network's units.
+        actions_BTA: the action that leads *to* each frame; zeros for the first frame of an episode.
+        pixels_BThwC: latents of each frame's image: of the frame before it, or for the first frame
+            of an episode its own. Further channels, such as rays, may be appended.
+        camera_BTN: numbers of that image's camera; see ``geometry.actions.camera_numbers``.
+        shown_BT: bool, whether a frame has its image; None means all have.
+        known_BTxyz: bool, which latents are known; tokens of others are not read by later frames.
+            None means all are.
 
     Raises:
         UserError: an argument of another shape, or cameras where the network takes none.

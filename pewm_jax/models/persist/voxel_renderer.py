@@ -75,15 +75,11 @@ def cast_rays(
     camera: Camera,
     size: tuple[int, int],
 ) -> RayHits:
-    """Return the hits (T, h, w, L) of the rays of T cameras in T grids; distances are depths.
+    """Return the hits (T, h·r, w·r, L) of the rays of T cameras in T grids; distances are depths.
 
-    With ``rays`` r above 1 the shape is (T, h·r, w·r, L).
-
-    Args:
-        classes_TXYZ: class ids of each frame's grid.
-        low_T3: the corner of each grid with the smallest coordinates, metres.
-        cell_m: side of a voxel, metres.
-        size: height and width of the images that their intrinsics are for, pixels.
+    r is ``config.rays``. ``low_T3`` is the corner of each grid with the smallest coordinates and
+    ``cell_m`` the side of a voxel, metres; the cameras' intrinsics are for images of this height
+    and width.
     """
     height, width = config.height * config.rays, config.width * config.rays
     shrink = width / size[1], height / size[0]
@@ -110,11 +106,9 @@ def features(
 ) -> Array:
     """Fold layers (..., h, w, L) into channels (..., h, w, F): first all of the nearest.
 
-    With several rays per latent, first all of the first ray.
-
-    Args:
-        drawn_hwC: (..., h, w, C) latents of the voxels drawn in the colours of their classes,
-            where the network takes them (``config.drawn``); they are the last channels.
+    With several rays per latent, first all of the first ray. ``drawn_hwC`` are latents of the
+    voxels drawn in the colours of their classes, where the network takes them (``config.drawn``);
+    they are the last channels.
 
     Raises:
         UserError: drawn voxels where the network takes none, or none where it does.
@@ -166,17 +160,11 @@ def apply(
     actions_BTA: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict the target of the noise from noisy latents of images.
+    """Predict the target of the noise from noisy latents of images, with the cache of these frames.
 
-    Args:
-        latents_BThwC: (B, T, h, w, C) noisy latents of T frames; their dtype is the dtype of the
-            computation.
-        features_BThwF: the voxels as each frame's camera sees them, from ``features``.
-        actions_BTA: the action that leads to each frame, where the network takes one.
-
-    Returns:
-        ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with
-        these frames, or None.
+    ``features_BThwF`` are the voxels as each frame's camera sees them, from ``features``;
+    ``actions_BTA`` lead to each frame, where the network takes actions. The dtype of the latents is
+    that of the computation.
 
     Raises:
         UserError: an argument of another shape.

@@ -6,22 +6,11 @@ The image encoder is CLIP's (``models.clip.convert``).
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from pewm_jax.errors import UserError
 from pewm_jax.io import published
-from pewm_jax.io.published import (
-    CONV,
-    LINEAR,
-    POINTWISE,
-    SAME,
-    TIME_CONV,
-    Entry,
-    Network,
-    Transform,
-    rename,
-)
+from pewm_jax.io.published import Entry, Network, Transform, rename
 from pewm_jax.models.svd import unet, vae
 from pewm_jax.models.svd.unet import SVDUNetBackbone
 from pewm_jax.models.svd.vae import SVDVAECodec
@@ -115,19 +104,21 @@ def unet_config_to_diffusers(config: SVDUNetBackbone) -> dict[str, Any]:
 
 def unet_entries(config: SVDUNetBackbone) -> list[Entry]:
     """Return one entry per tensor of the reference."""
+    rules = (*_UNET_RULES, *RULES)
     return [
-        Entry(_unet_name(path), path, _transform(path, s))
-        for path, s in unet.layout(config).items()
+        Entry(rename(path, rules), path, _transform(path, shape))
+        for path, shape in unet.layout(config).items()
     ]
 
 
 def _transform(path: str, shape: tuple[int, ...]) -> Transform:
     """Return the change of layout of a leaf."""
     if not path.endswith("/kernel"):
-        return SAME
+        return published.SAME
     if len(shape) == 2:
-        return POINTWISE if "/shortcut/" in path else LINEAR
-    return TIME_CONV if len(shape) == 3 else CONV
+        pointwise = "/shortcut/" in path or path == "encoder/quant/kernel"
+        return published.POINTWISE if pointwise else published.LINEAR
+    return published.TIME_CONV if len(shape) == 3 else published.CONV
 
 
 RULES = (
@@ -154,18 +145,6 @@ _UNET_RULES = (
     (r"\b(ff|ff_in)/up/", r"\1.net.0.proj/"),
     (r"\b(ff|ff_in)/down/", r"\1.net.2/"),
 )
-
-
-def _unet_name(path: str) -> str:
-    """Turn ``up_0/resnet_1/temporal/norm1/scale`` into the reference's name."""
-    return renamed(path, (*_UNET_RULES, *RULES))
-
-
-def renamed(path: str, rules: tuple[tuple[str, str], ...]) -> str:
-    """Apply rules to a path of ours and return the reference's name."""
-    path = rename(path, rules)
-    path = re.sub(r"/(kernel|scale)$", "/weight", path)
-    return re.sub(r"\.+", ".", path.replace("/", "."))
 
 
 def _numbers(given: dict[str, Any], key: str, count: int | None) -> tuple[int, ...]:
@@ -229,14 +208,11 @@ def vae_config_to_diffusers(config: SVDVAECodec) -> dict[str, Any]:
 
 def vae_entries(config: SVDVAECodec) -> list[Entry]:
     """Return one entry per tensor of the reference."""
-    return [_vae_entry(path, shape) for path, shape in vae.layout(config).items()]
-
-
-def _vae_entry(path: str, shape: tuple[int, ...]) -> Entry:
-    """Pair a leaf with the reference's tensor."""
-    quant = path == "encoder/quant/kernel"
-    change = POINTWISE if quant else _transform(path, shape)
-    return Entry(renamed(path, (*_VAE_RULES, *RULES)), path, change)
+    rules = (*_VAE_RULES, *RULES)
+    return [
+        Entry(rename(path, rules), path, _transform(path, shape))
+        for path, shape in vae.layout(config).items()
+    ]
 
 
 UNET = Network(

@@ -233,21 +233,16 @@ def apply(
     added_BK: Array,
     modulation_BTE: Array | None = None,
 ) -> Array:
-    """Predict from noisy latents.
+    """Predict from noisy latents: (B, T, h, w, out_channels).
 
     Args:
         latents_BThwC: (B, T, h, w, in_channels) scaled noisy latents and, joined to their channels,
-            the latents of the image. Their dtype is the dtype of the computation. Any size will
-            do.
-        timesteps_B: (B,) noise level in the network's units: log σ / 4.
-        image_BMD: (B, M, image_dim) embedding of the image; M is 1 in the published model.
-        added_BK: (B, added) scalars: frames per second less 1, motion bucket, deviation of the
-            noise that the image got.
-        modulation_BTE: (B, T, time_dim) added to the time embedding of each frame; None for
-            nothing.
-
-    Returns:
-        (B, T, h, w, out_channels) prediction.
+            the latents of the image; of any size. Their dtype is that of the computation.
+        timesteps_B: noise level in the network's units: log σ / 4.
+        image_BMD: embedding of the image; M is 1 in the published model.
+        added_BK: scalars: frames per second less 1, motion bucket, deviation of the noise that the
+            image got.
+        modulation_BTE: (B, T, time_dim) added to the time embedding of each frame.
 
     Raises:
         UserError: an argument of another shape.

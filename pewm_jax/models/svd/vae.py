@@ -118,14 +118,10 @@ def init(config: SVDVAECodec, key: Array) -> Params:
 
 
 def encode(config: SVDVAECodec, params: Params, video_BTHWC: Array) -> Array:
-    """Encode every frame to the mean of its latents, which is the distribution's mode.
+    """Encode every frame to the mean of its latents, (B, T, H/8, W/8, z), not scaled.
 
-    Args:
-        video_BTHWC: (B, T, H, W, C) floats in [−1, 1]; their dtype is that of the computation.
-            H and W are multiples of ``config.spatial``.
-
-    Returns:
-        (B, T, H/8, W/8, z), not scaled.
+    The mean is the distribution's mode. The video is of floats in [−1, 1], whose dtype is that of
+    the computation; H and W are multiples of ``config.spatial``.
 
     Raises:
         UserError: an array of another shape, or a size that is no multiple.
@@ -144,16 +140,10 @@ def encode(config: SVDVAECodec, params: Params, video_BTHWC: Array) -> Array:
 def decode(
     config: SVDVAECodec, params: Params, latents_BThwC: Array, *, at_once: int | None = None
 ) -> Array:
-    """Decode latents to a video.
+    """Decode latents (B, T, h, w, z) to a video (B, T, 8h, 8w, C) in about [−1, 1].
 
-    Args:
-        latents_BThwC: (B, T, h, w, z) latents, divided by ``config.scaling_factor`` again; their
-            dtype is that of the computation.
-        at_once: frames that are decoded together, as ``decode_chunk_size`` of diffusers'
-            pipeline; None for all.
-
-    Returns:
-        (B, T, 8h, 8w, C) video in about [−1, 1].
+    The latents are divided by ``config.scaling_factor`` again; their dtype is that of the
+    computation. ``at_once`` frames are decoded together (diffusers: ``decode_chunk_size``).
 
     Raises:
         UserError: an array of another shape, or ``at_once`` below 1.

@@ -12,16 +12,7 @@ from typing import Any
 
 from pewm_jax.errors import UserError
 from pewm_jax.io import published
-from pewm_jax.io.published import (
-    CONV,
-    POINTWISE,
-    SAME,
-    TIME_CONV,
-    Entry,
-    Network,
-    Transform,
-    rename,
-)
+from pewm_jax.io.published import Entry, Network, Transform, rename
 from pewm_jax.models.wan import vae
 from pewm_jax.models.wan.vae import MEAN_16, STD_16, WanVAECodec
 
@@ -104,10 +95,10 @@ def _transform(path: str, shape: tuple[int, ...]) -> Transform:
     if path.endswith("/scale"):
         return GAMMA_2D if attends else GAMMA_3D
     if path.endswith("/bias"):
-        return SAME
+        return published.SAME
     if len(shape) == 2:
-        return POINTWISE if attends else POINTWISE_3D
-    return TIME_CONV if len(shape) == 3 else CONV
+        return published.POINTWISE if attends else POINTWISE_3D
+    return published.TIME_CONV if len(shape) == 3 else published.CONV
 
 
 def _name(config: WanVAECodec, path: str) -> str:
@@ -134,9 +125,7 @@ def _name(config: WanVAECodec, path: str) -> str:
         (r"attend_(\d+)/", r"attentions.\1/"),
         (r"to_out/", "proj/"),
         (r"shortcut/", "conv_shortcut/"),
-        (r"/kernel$", "/weight"),
         (r"/scale$", "/gamma"),
-        (r"/", "."),
     )
     return rename(path, rules)
 

@@ -192,17 +192,11 @@ def _statistics(config: WanVAECodec, dtype: jnp.dtype) -> tuple[Array, Array]:
 
 
 def encode(config: WanVAECodec, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
-    """Encode a video to the mean and variance of its latents.
+    """Encode a video to mean and logarithm of the variance of its latents, (B, n + 1, H/8, W/8, z).
 
-    To sample, compute mean + exp(logvar / 2)·noise.
-
-    Args:
-        video_BTHWC: (B, T, H, W, C) floats in [−1, 1]; their dtype is that of the computation.
-            T is 4n + 1. Rows and columns beyond a multiple of ``config.spatial`` become no
-            latents, as in the reference.
-
-    Returns:
-        Mean and logarithm of the variance, each (B, n + 1, H/8, W/8, z), not normalised.
+    They are not normalised. To sample, compute mean + exp(logvar / 2)·noise. The video is of floats
+    in [−1, 1], whose dtype is that of the computation; T is 4n + 1. Rows and columns beyond a
+    multiple of ``config.spatial`` become no latents, as in the reference.
 
     Raises:
         UserError: an array of another shape, or a video that cannot be encoded.
@@ -224,10 +218,7 @@ def encode(config: WanVAECodec, params: Params, video_BTHWC: Array) -> tuple[Arr
 
 
 def decode(config: WanVAECodec, params: Params, latents_BthwC: Array) -> Array:
-    """Decode latents (B, t, h, w, z), not normalised, in the dtype of the computation.
-
-    Returns:
-        (B, 4·(t − 1) + 1, 8h, 8w, C) video, clipped to [−1, 1].
+    """Decode latents (B, t, h, w, z), not normalised, to (B, 4·(t − 1) + 1, 8h, 8w, C) in [−1, 1].
 
     Raises:
         UserError: an array of another shape.
