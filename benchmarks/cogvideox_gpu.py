@@ -37,7 +37,7 @@ from pewm_jax.io import atomic
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 
 NAME = "cogvideox_gpu"
 OURS = ("ceiling", "forward", "train", "clip", "decode")

@@ -27,7 +27,7 @@ from record import machine, record, table
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.convert import VAE
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 
 NAME = "cogvideox_vae"
 GOAL = 0.8

@@ -2,7 +2,7 @@
 
 from pewm_jax.config import Config
 from pewm_jax.models.cosmos.backbone import COSMOS_2B
-from pewm_jax.models.wan.codec import WanVAECodec
+from pewm_jax.models.wan.vae import WanVAECodec
 from pewm_jax.worlds.egowm import paper as egowm_paper
 
 

@@ -1,8 +1,8 @@
 """EgoWM on Stable Video Diffusion: 9 frames of 512×512, steered by (dx, dy, dyaw)."""
 
 from pewm_jax.config import Config
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
-from pewm_jax.models.svd.vae_codec import SVDVAECodec
+from pewm_jax.models.svd.unet import SVDUNetBackbone
+from pewm_jax.models.svd.vae import SVDVAECodec
 from pewm_jax.worlds.egowm import paper as egowm_paper
 
 

@@ -5,8 +5,8 @@ import dataclasses
 from pewm_jax.config import Config
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.cogvideox.vae import VAECodec
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.worlds.pewm import paper
 
 

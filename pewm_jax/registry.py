@@ -72,15 +72,15 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "backbone": {
         "dit": "pewm_jax.models.cogvideox.backbone:DiTBackbone",
-        "svd_unet": "pewm_jax.models.svd.backbone:SVDUNetBackbone",
+        "svd_unet": "pewm_jax.models.svd.unet:SVDUNetBackbone",
         "cosmos": "pewm_jax.models.cosmos.backbone:CosmosBackbone",
         "persist": "pewm_jax.models.persist.nets:PersistNetsConfig",
     },
     "codec": {
         "pixel": "pewm_jax.codecs.pixel:PixelConfig",
-        "vae": "pewm_jax.models.cogvideox.vae_codec:VAECodec",
-        "svd_vae": "pewm_jax.models.svd.vae_codec:SVDVAECodec",
-        "wan_vae": "pewm_jax.models.wan.codec:WanVAECodec",
+        "vae": "pewm_jax.models.cogvideox.vae:VAECodec",
+        "svd_vae": "pewm_jax.models.svd.vae:SVDVAECodec",
+        "wan_vae": "pewm_jax.models.wan.vae:WanVAECodec",
         "learned": "pewm_jax.codecs.learned:LearnedCodecConfig",
     },
     "control": {
@@ -90,7 +90,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     "encoder": {
         "patch_colours": "pewm_jax.encoders.simple:PatchColoursConfig",
         "latents": "pewm_jax.encoders.simple:LatentsConfig",
-        "dinov2": "pewm_jax.models.dinov2.encoder:DINOv2EncoderConfig",
+        "dinov2": "pewm_jax.models.dinov2.model:DINOv2EncoderConfig",
     },
     "reader": {
         "attend": "pewm_jax.readers.attention:AttentionConfig",

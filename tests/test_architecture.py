@@ -76,7 +76,7 @@ HOMES = {
 """Libraries and the only files and folders that import them."""
 FORMER_COMMANDS = {f"{name}/__main__" for name in ("convert", "data", "memory")}
 """``python -m pewm_jax.data`` and the like: the former names of commands."""
-BY_STRING = {"import_module", "__import__", "find_spec", "convert_extra"}
+BY_STRING = {"import_module", "__import__", "find_spec"}
 """Functions whose first argument is the name of a module that they import or look for."""
 ANY_NAME = {
     "cli/plugins",
@@ -86,7 +86,6 @@ ANY_NAME = {
     "config/__init__",
     "registry",
     "presets/__init__",
-    "convert/output",
 }
 """Files that import by a name which is not written where it is imported."""
 FILES = sorted((ROOT / "pewm_jax").rglob("*.py"))
@@ -213,7 +212,6 @@ def test_the_presets_have_one_name(path):
         "def f():\n    import flax.linen",
         "importlib.import_module('orbax.checkpoint')",
         "if TYPE_CHECKING:\n    import torch",
-        "def f():\n    torch = output.convert_extra('torch')",
         "import configs",
     ],
 )

@@ -17,6 +17,8 @@ the video model inside is written, without the memory blocks and the channels of
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import re
 import shutil
 from collections.abc import Sequence
@@ -27,16 +29,18 @@ import jax
 import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.config import Config, UserError
-from pewm_jax.convert import output, pipeline, schedulers, widen
+from pewm_jax.config import ClipConfig, Config, Encoder, UserError
+from pewm_jax.convert import pipeline, schedulers, widen
 from pewm_jax.convert.pipeline import CONFIG, WEIGHTS
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import sources, tensor_files, tree, weights
 from pewm_jax.io.published import Network
+from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.types import Params
+from pewm_jax.worlds.pewm import paper
 
 PIPELINES = (
     "CogVideoXPipeline",
@@ -52,26 +56,12 @@ _TEXT = ("text_encoder", "tokenizer")
 """Parts that are copied without conversion."""
 
 
-def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[DiTBackbone, Params]:
-    """Read the transformer for ``pewm_jax.models.cogvideox.model.apply``; see ``pipeline.read``."""
-    return pipeline.read(TRANSFORMER, folder, dtype)
-
-
-def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[VAECodec, Params]:
-    """Read the VAE for ``pewm_jax.models.cogvideox.vae``; see ``pipeline.read``."""
-    return pipeline.read(VAE, folder, dtype)
-
-
-def read_scheduler(folder: str | Path) -> DDPMConfig:
-    """Read the scheduler of a CogVideoX checkpoint: settings only, it has no weights.
-
-    Args:
-        folder: a diffusers pipeline's folder, or the scheduler's folder in it.
-
-    Raises:
-        UserError: a class or setting is unknown.
-    """
-    return schedulers.read(schedulers.COGVIDEOX, folder)
+read_transformer = functools.partial(pipeline.read, TRANSFORMER)
+"""Read the transformer for ``pewm_jax.models.cogvideox.model.apply``; see ``pipeline.read``."""
+read_vae = functools.partial(pipeline.read, VAE)
+"""Read the VAE for ``pewm_jax.models.cogvideox.vae``; see ``pipeline.read``."""
+read_scheduler = functools.partial(schedulers.read, schedulers.COGVIDEOX)
+"""Read the scheduler of a checkpoint, a ``DDPMConfig``; see ``schedulers.read``."""
 
 
 def require_pipeline(src: Path) -> None:
@@ -94,18 +84,20 @@ def require_pipeline(src: Path) -> None:
         )
 
 
-def load_transformer(folder: str | Path) -> tuple[DiTBackbone, Params]:
-    """Load the transformer of an imported folder.
+def load(network: Network, folder: str | Path) -> tuple[Any, Params]:
+    """Load a network of an imported folder: its configuration and NumPy parameters.
 
     Raises:
         UserError: it is missing or damaged.
     """
-    return _load(TRANSFORMER, Path(folder))
+    inside = Path(folder) / network.folder
+    config = configuration.load(inside / CONFIG, network.config_class)
+    params = weights.load(inside / WEIGHTS)
+    weights.check(params, network.like(config), str(inside / WEIGHTS))
+    return config, params
 
 
-def load_vae(folder: str | Path) -> tuple[VAECodec, Params]:
-    """Load the VAE of an imported folder; see ``load_transformer``."""
-    return _load(VAE, Path(folder))
+load_transformer, load_vae = (functools.partial(load, part) for part in (TRANSFORMER, VAE))
 
 
 def load_scheduler(folder: str | Path) -> DDPMConfig:
@@ -113,20 +105,12 @@ def load_scheduler(folder: str | Path) -> DDPMConfig:
     return configuration.load(Path(folder) / "scheduler" / CONFIG, DDPMConfig)
 
 
-def _load(network: Network, folder: Path) -> tuple[Any, Params]:
-    inside = folder / network.folder
-    config = configuration.load(inside / CONFIG, network.config_class)
-    params = weights.load(inside / WEIGHTS)
-    weights.check(params, network.like(config), str(inside / WEIGHTS))
-    return config, params
-
-
 def write_network(config: Any, params: Params, folder: Path) -> None:
     """Write one network in our layout."""
     folder.mkdir(parents=True)
     configuration.save(config, folder / CONFIG)
     size = tensor_files.size(tree.flatten(params))
-    with output.megabytes(f"write {folder.name}", size) as progress:
+    with pipeline.megabytes(f"write {folder.name}", size) as progress:
         weights.save(folder / WEIGHTS, params, progress=progress)
 
 
@@ -136,13 +120,11 @@ def import_pipeline(
     """Write an imported folder, one network at a time.
 
     Args:
-        src: a diffusers pipeline's folder.
-        dst: the folder to create; it must not exist.
         dtype: dtype of the weights; by default the stored one.
         prompts: prompt → tokens (L, text_dim); empty without a text encoder.
         record: the content of ``base.json``.
     """
-    with output.new_folder(dst) as folder:
+    with pipeline.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
             write_network(*pipeline.read(network, src, dtype), folder / network.folder)
         (folder / "scheduler").mkdir()
@@ -151,7 +133,7 @@ def import_pipeline(
             stacked = np.stack(list(prompts.values()))
             kind = np.dtype(jax.numpy.dtype(dtype or "float32"))
             weights.save(folder / "text" / WEIGHTS, {"prompts_PLC": stacked.astype(kind)})
-        output.write_json(folder / BASE, record)
+        pipeline.write_json(folder / BASE, record)
 
 
 def describe_base(
@@ -162,11 +144,8 @@ def describe_base(
 ) -> dict[str, Any]:
     """Return the content of ``base.json``.
 
-    Args:
-        src: the pipeline's folder.
-        settings: the original settings of ``PARTS``.
-        prompts: the encoded prompts, in the order in which they are stored.
-        dtype: the requested dtype, None for the stored one.
+    ``settings`` are the original ones of ``PARTS``; prompts are in the order in which they are
+    stored.
     """
     index = src / "model_index.json"
     return {
@@ -217,6 +196,117 @@ def load_base(folder: Path) -> dict[str, Any]:
     return values
 
 
+def config_of(
+    dit: DiTBackbone,
+    vae: VAECodec,
+    noise: DDPMConfig,
+    size: tuple[int | None, int | None, int | None],
+    dtype: str | None,
+    *,
+    run: str = "world",
+    encoder: Encoder | None = None,
+) -> Config:
+    """Return the settings of the world model around a video model.
+
+    Training and memory are those of the presets ``pewm_2b`` and ``pewm_5b``; clip, codec, backbone
+    and noise are the checkpoint's. Memory blocks are not wider than the transformer.
+
+    Args:
+        size: frames, height and width of a clip; None for the paper's 9 × 512 × 512, or for the
+            size of the learned positions if they allow no other.
+        dtype: dtype of the weights; 16-bit weights are computed in bfloat16.
+        run: name of the experiment, for the folder of its runs.
+        encoder: the image features stored in the map, by default the colours of patches.
+
+    Raises:
+        ConfigError: the network does not support the size.
+    """
+    usual = dataclasses.astuple(paper.CLIP)[:3]
+    if dit.positions == "rope_learned" and dit.learned in ("exact", "reference"):
+        scale = vae.spatial
+        usual = (dit.sample_frames, dit.sample_height * scale, dit.sample_width * scale)
+    frames, height, width = (
+        value if given is None else given for given, value in zip(size, usual, strict=True)
+    )
+    return paper.experiment(
+        dit,
+        vae,
+        noise,
+        run=run,
+        clip=ClipConfig(frames=frames, height=height, width=width),
+        encoder=encoder,
+        dtype="float32" if dtype in (None, "float32") else "bfloat16",
+    )
+
+
+def require_size(config: Config) -> None:
+    """Check that the transformer's positions cover a clip.
+
+    Raises:
+        UserError: they are learned for another size, or are too few.
+    """
+    frames, height, width = config.model.latent_shape
+    frames += -frames % config.model.backbone.patch_t
+    clip = config.model.clip
+    try:
+        positions.token_grid(config.model.backbone, (1, frames, height, width, 1))
+    except UserError as error:
+        raise UserError(f"A clip of {clip.frames}×{clip.height}×{clip.width}: {error}") from None
+
+
+def import_world(
+    src: Path,
+    dst: Path,
+    config: Config,
+    prompt_LC: np.ndarray | None,
+    record: dict[str, Any],
+    *,
+    memory: bool,
+    encoder: Params | None = None,
+    dtype: str | None = None,
+    seed: int = 0,
+) -> None:
+    """Write a world model's folder: ``config.json``, ``weights.safetensors``, ``base.json``.
+
+    It is written part by part, so at most one network is in memory at a time.
+
+    Args:
+        config: the world model, from ``config_of``.
+        prompt_LC: (L, text_dim) tokens of the prompt, None without a text encoder.
+        record: the content of ``base.json``.
+        memory: whether to add memory blocks, drawn from ``seed``.
+        encoder: parameters of the map's image encoder, if it has any.
+        dtype: dtype of the weights; by default the stored one, and float32 for memory blocks.
+    """
+    old = TRANSFORMER.config(record["transformer"], BASE)
+    channels = config.model.control.channels(config.model)
+    plan = widen.plan(old, config.model.codec.latent_channels, channels)
+
+    def backbone() -> Params:
+        return widen.widen(plan, read_transformer(src, dtype)[1])
+
+    def blocks() -> Params:
+        return jax.jit(lambda k: config.model.memory.reader.init(config.model, k))(
+            jax.random.key(seed)
+        )
+
+    wide = tree.flatten(TRANSFORMER.like(plan.new))
+    stored = pipeline.specs(TRANSFORMER, src, dtype)
+    specs = {p: jax.ShapeDtypeStruct(wide[p].shape, spec.dtype) for p, spec in stored.items()}
+    parts: dict[str, pipeline.Part] = {"backbone": (specs, backbone)}
+    if memory:
+        parts["memory"] = (pipeline.cast_specs(jax.eval_shape(blocks), dtype), blocks)
+    parts["codec"] = pipeline.part(VAE, src, dtype)
+    given: dict[str, Params] = {}
+    if encoder is not None:
+        given["encoder"] = encoder
+    if prompt_LC is not None:
+        given["text"] = {"prompt_LC": prompt_LC}
+    for name, params in given.items():
+        parts[name] = (pipeline.cast_specs(params, dtype), functools.partial(dict, params))
+    pipeline.write_world(dst, config, parts, {BASE: record})
+
+
 def export(
     src: Path,
     dst: Path,
@@ -228,7 +318,6 @@ def export(
 
     Args:
         src: an imported folder, a widened one, or a training run.
-        dst: the folder to create.
         base_folder: the folder with ``base.json``; by default ``src`` or, for a training run, the
             folder it started from.
         dtype: dtype of the tensors; by default that of our weights.
@@ -239,21 +328,21 @@ def export(
     """
     if not src.is_dir():
         raise UserError(f"{src} is not a folder; give an imported folder or a training run.")
-    output.refuse_existing(dst)
+    pipeline.refuse_existing(dst)
     record = load_base(base_folder or _origin(src))
     absent = [name for name in _TEXT if original and not (original / name).is_dir()]
     if absent:
         raise UserError(f"{original} has no folder {absent[0]}/; give the original pipeline's.")
     imported = (src / "transformer").is_dir()
-    with output.new_folder(dst) as folder:
+    with pipeline.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
-            params = _imported_params(src, network) if imported else _run(src, network, record)
+            params = load(network, src)[1] if imported else _run(src, network, record)
             values = record[network.folder]
             pipeline.write_published(network, values, params, folder / network.folder, dtype)
             del params
         (folder / "scheduler").mkdir()
-        output.write_json(folder / "scheduler" / "scheduler_config.json", record["scheduler"])
-        output.write_json(folder / "model_index.json", _index(record, text=original is not None))
+        pipeline.write_json(folder / "scheduler" / "scheduler_config.json", record["scheduler"])
+        pipeline.write_json(folder / "model_index.json", _index(record, text=original is not None))
         if original:
             for name in _TEXT:
                 shutil.copytree(original / name, folder / name)
@@ -270,11 +359,6 @@ def _origin(src: Path) -> Path:
             return src
         here = Path(start)
     return here
-
-
-def _imported_params(src: Path, network: Network) -> Params:
-    load = load_transformer if network is TRANSFORMER else load_vae
-    return load(src)[1]
 
 
 def _run(src: Path, network: Network, record: dict[str, Any]) -> Params:

@@ -11,11 +11,9 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.config.overlay import overlay
 from pewm_jax.convert import (
     cogvideox,
-    cogvideox_world,
     cosmos,
     dinov2,
     inference,
-    output,
     pipeline,
     schedulers,
     stablehlo,
@@ -35,16 +33,16 @@ from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.config import Learned
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.dinov2 import model as dinov2_model
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.types import Params
 
 
 def import_cogvideox(options: ImportCogVideoX) -> None:
     """Run ``import cogvideox``."""
     src, dst = options.src, options.dst
-    output.refuse_existing(dst)
+    pipeline.refuse_existing(dst)
     cogvideox.require_pipeline(src)
     settings = {part.folder: pipeline.published_config(part, src) for part in (TRANSFORMER, VAE)}
     settings["scheduler"] = schedulers.published_config(schedulers.COGVIDEOX, src)
@@ -63,7 +61,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
         tokens: Literal["zeros", "stored"] = "zeros" if prompt is None else "stored"
         backbone = dataclasses.replace(config.model.backbone, prompt=tokens)
         config = config.with_model(backbone=backbone)
-        cogvideox_world.import_world(
+        cogvideox.import_world(
             src,
             dst,
             config,
@@ -87,7 +85,7 @@ def _world(
     """
     size = (options.frames, options.height, options.width)
     network, params = dinov2_model.load(options.encoder) if options.encoder else (None, None)
-    config = cogvideox_world.config_of(
+    config = cogvideox.config_of(
         _with_positions(dit, options.positions),
         vae,
         noise,
@@ -97,7 +95,7 @@ def _world(
         encoder=DINOv2EncoderConfig(network=network) if network else None,
     )
     config = overlay(config, options.config) if options.config else config
-    cogvideox_world.require_size(config)
+    cogvideox.require_size(config)
     kept = config.model.memory.encoder
     if network and not (isinstance(kept, DINOv2EncoderConfig) and kept.network == network):
         raise UserError(

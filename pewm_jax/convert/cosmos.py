@@ -10,57 +10,27 @@ actions, which have no effect until they are trained.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Literal
 
 from pewm_jax.config import Config, UserError
-from pewm_jax.convert import output, pipeline, schedulers, text
-from pewm_jax.diffusion.edm import EDMConfig
-from pewm_jax.models.cosmos.backbone import CosmosBackbone
+from pewm_jax.convert import pipeline, schedulers, text
 from pewm_jax.models.cosmos.convert import TRANSFORMER
-from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.models.wan.convert import VAE
 from pewm_jax.types import Params
 from pewm_jax.worlds.egowm import paper as egowm_paper
 
-
-def read_transformer(folder: str | Path, dtype: str | None = None) -> tuple[CosmosBackbone, Params]:
-    """Read the transformer for ``pewm_jax.models.cosmos.model.apply``; see ``pipeline.read``."""
-    return pipeline.read(TRANSFORMER, folder, dtype)
-
-
-def write_transformer(
-    config: CosmosBackbone, params: Params, folder: str | Path, dtype: str | None = None
-) -> None:
-    """Write the transformer for diffusers' ``from_pretrained``; see ``pipeline.write``.
-
-    Settings of the attention implementation and of rematerialization are not written.
-    """
-    pipeline.write(TRANSFORMER, config, params, folder, dtype)
-
-
-def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[WanVAECodec, Params]:
-    """Read the autoencoder for ``pewm_jax.models.wan.vae``; see ``pipeline.read``."""
-    return pipeline.read(VAE, folder, dtype)
-
-
-def write_vae(
-    config: WanVAECodec, params: Params, folder: str | Path, dtype: str | None = None
-) -> None:
-    """Write the autoencoder for diffusers' ``from_pretrained``; see ``pipeline.write``."""
-    pipeline.write(VAE, config, params, folder, dtype)
-
-
-def read_scheduler(folder: str | Path) -> EDMConfig:
-    """Read the scheduler of a checkpoint: settings only, it has no weights.
-
-    Args:
-        folder: a diffusers pipeline's folder, or the scheduler's folder in it.
-
-    Raises:
-        UserError: a class or setting is unknown.
-    """
-    return schedulers.read(schedulers.COSMOS, folder)
+read_transformer = functools.partial(pipeline.read, TRANSFORMER)
+"""Read the transformer for ``pewm_jax.models.cosmos.model.apply``; see ``pipeline.read``."""
+write_transformer = functools.partial(pipeline.write, TRANSFORMER)
+"""Write the transformer for diffusers' ``from_pretrained``; see ``pipeline.write``."""
+read_vae = functools.partial(pipeline.read, VAE)
+"""Read the autoencoder for ``pewm_jax.models.wan.vae``; see ``pipeline.read``."""
+write_vae = functools.partial(pipeline.write, VAE)
+"""Write the autoencoder for diffusers' ``from_pretrained``; see ``pipeline.write``."""
+read_scheduler = functools.partial(schedulers.read, schedulers.COSMOS)
+"""Read the scheduler of a checkpoint, an ``EDMConfig``; see ``schedulers.read``."""
 
 
 def config_of(
@@ -68,12 +38,8 @@ def config_of(
 ) -> Config:
     """Return the settings of the world model around a pipeline's networks.
 
-    Args:
-        src: the pipeline's folder.
-        dst: the folder to create; runs get its name.
-        dtype: dtype of the weights; 16-bit weights are computed in bfloat16.
-        clip: frames, height and width.
-        prompt: whether the embeddings of prompts are stored.
+    16-bit weights are computed in bfloat16. ``clip`` is frames, height and width, and ``prompt``
+    tells whether the embeddings of prompts are stored.
 
     Raises:
         UserError: a network of another class, unknown settings, or a transformer that is not for
@@ -81,8 +47,6 @@ def config_of(
         ConfigError: the networks do not fit each other or the clip.
     """
     transformer, vae = (pipeline.read_config(network, src) for network in (TRANSFORMER, VAE))
-    assert isinstance(transformer, CosmosBackbone)
-    assert isinstance(vae, WanVAECodec)
     latents = vae.latent_channels
     found = transformer.in_channels, transformer.out_channels
     if found != (latents + 1, latents):
@@ -109,12 +73,11 @@ def import_world(
     clip: tuple[int, int, int] = egowm_paper.COSMOS_CLIP,
     prompts: tuple[str, str] = ("", ""),
 ) -> bool:
-    """Write the folder: ``config.json`` and ``weights.safetensors``.
+    """Write a world model's folder: ``config.json`` and ``weights.safetensors``.
 
     Args:
         src: a pipeline's folder in the layout of diffusers: transformer/, vae/, scheduler/ and, if
             there is one, text_encoder/ with tokenizer/.
-        dst: the folder to create.
         dtype: dtype of the weights; by default the stored one, and float32 for the actions' layers
             and the prompts.
         clip: frames, height and width.
@@ -127,7 +90,7 @@ def import_world(
         UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another type.
         ConfigError: the networks do not fit each other or the clip.
     """
-    output.refuse_existing(dst)
+    pipeline.refuse_existing(dst)
     backbone, codec = (pipeline.part(network, src, dtype) for network in (TRANSFORMER, VAE))
     stored = backbone[0]["proj_out/kernel"].dtype.name
     config = config_of(src, dst, dtype or stored, clip, prompt=False)

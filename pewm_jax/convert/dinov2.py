@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import jax
-import numpy as np
 
 from pewm_jax import config as configuration
-from pewm_jax.convert import output, pipeline
+from pewm_jax.convert import pipeline
 from pewm_jax.errors import UserError
 from pewm_jax.io import sources, tree, weights
 from pewm_jax.io.sources import Source
@@ -33,15 +31,15 @@ def read(src: Path | str, dtype: str | None = None) -> tuple[DINOv2Config, Param
     Args:
         src: a folder with config.json and safetensors (single or sharded); or a state dict of the
             original repository, .safetensors or .pth, or the folder that contains only this file.
-            A .pth is read by ``torch.load(weights_only=True)``, which runs no code.
+            A .pth is read as data, without torch.
         dtype: dtype of the parameters; by default the stored one.
 
     Returns:
         The configuration, and NumPy parameters for ``pewm_jax.models.dinov2.model``.
 
     Raises:
-        UserError: not DINOv2, a tensor is missing, unexpected or has a wrong shape, a file is
-            damaged, or torch is needed and not installed.
+        UserError: not DINOv2, a tensor is missing, unexpected or has a wrong shape, or a file is
+            damaged.
     """
     src = Path(src)
     settings = src / "config.json"
@@ -61,7 +59,7 @@ def write(config: DINOv2Config, params: Params, dst: Path | str) -> None:
     """
     dst = Path(dst)
     weights.check(params, _like(config), "the tree to be written")
-    with output.new_folder(dst) as folder:
+    with pipeline.new_folder(dst) as folder:
         weights.save(folder / "weights.safetensors", params, {"network": "dinov2"})
         configuration.save(config, folder / "config.json")
 
@@ -72,18 +70,12 @@ def convert(
     dtype: str | None = None,
     log: Callable[[str], None] = print,
 ) -> None:
-    """Import DINOv2: ``read`` and ``write``.
-
-    Args:
-        src: see ``read``.
-        dst: the folder to create.
-        dtype: dtype of the stored parameters; by default the source's.
-        log: called with a line that describes the import.
+    """Import DINOv2: ``read`` and ``write``; ``log`` is called with a line that describes it.
 
     Raises:
         UserError: ``src`` cannot be read, or ``dst`` exists.
     """
-    output.refuse_existing(Path(dst))
+    pipeline.refuse_existing(Path(dst))
     config, params = read(src, dtype)
     write(config, params, dst)
     leaves = jax.tree.leaves(params)
@@ -114,33 +106,6 @@ def open_source(src: Path) -> Source:
         src = pickled[0]
     if not src.is_file():
         raise UserError(f"{src} does not exist; give a transformers folder or a DINOv2 state dict.")
-    return _read_state_dict(src) if src.suffix in _PICKLED else sources.open_file(src)
-
-
-def _read_state_dict(path: Path) -> Source:
-    """Read a state dict saved by torch, without executing code in it."""
-    try:
-        import torch  # noqa: PLC0415 - an extra: only these files need it
-    except ImportError:
-        raise UserError(
-            f"{path} is a torch file, and torch is not installed: pip install 'pewm-jax[convert]'."
-        ) from None
-    try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UserError(
-            f"{path} cannot be read as a state dict ({first}); download it again."
-        ) from error
-    if not isinstance(found, dict) or not all(
-        isinstance(name, str) and isinstance(value, torch.Tensor) for name, value in found.items()
-    ):
-        raise UserError(f"{path} is not a plain table of names and tensors, a state dict.")
-    return sources.in_memory({name: _to_numpy(torch, x) for name, x in found.items()}, str(path))
-
-
-def _to_numpy(torch: Any, tensor: Any) -> np.ndarray:
-    """Return a torch tensor's values, bfloat16 included."""
-    if tensor.dtype == torch.bfloat16:
-        return tensor.contiguous().view(torch.uint16).numpy().view(jax.numpy.bfloat16)
-    return tensor.numpy()
+    if src.suffix in _PICKLED:
+        return sources.in_memory(weights.read_others(src, "DINOv2"), str(src))
+    return sources.open_file(src)

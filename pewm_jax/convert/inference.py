@@ -28,7 +28,7 @@ from pewm_jax import __version__, worlds
 from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
 from pewm_jax.config import Config, UserError, World
-from pewm_jax.convert import output
+from pewm_jax.convert import pipeline
 from pewm_jax.data.dataset import read_manifest
 from pewm_jax.eval.evaluate import METRICS
 from pewm_jax.io import sources, tensor_files, tree, weights
@@ -47,26 +47,17 @@ TRAINED_ON = "train"
 def export(
     run: Path, dst: Path, dtype: str = "bfloat16", *, log: Callable[[str], Any] = print
 ) -> Path:
-    """Write the inference weights and settings of a training run into a new folder.
+    """Write the inference weights and settings of a training run into a new folder, ``dst``.
 
-    The run's weights file already contains the EMA of trained weights and the frozen
-    weights. The folder is written under a temporary name and renamed when it is complete.
-
-    Args:
-        run: a run folder made by ``train.py`` (or a converted checkpoint in the same form).
-        dst: the folder to create.
-        dtype: ``bfloat16`` or ``float16``.
-        log: called with a line per step.
-
-    Returns:
-        ``dst``.
+    The run is a folder made by ``train.py`` (or a converted checkpoint in the same form). Its
+    weights file already contains the EMA of trained weights and the frozen weights.
 
     Raises:
         UserError: ``dst`` exists; or the run is missing, damaged, a policy, or has no weights yet.
     """
     if not run.is_dir():
         raise UserError(f"{run} is not a folder; give a run made by train.py.")
-    with output.new_folder(dst) as folder:
+    with pipeline.new_folder(dst) as folder:
         log(f"reading {run} …")
         config, params = rollouts.load_finished(run)
         if not config.model.EXPORTED:
@@ -86,8 +77,7 @@ def export(
             base=sources.read_json(origin) if origin else None,
             metrics=_metrics(run),
         )
-        total = sum(np.size(leaf) for leaf in jax.tree.leaves(params))
-        log(f"writing {total / 1e6:.1f} million parameters in {dtype} …")
+        log(f"writing {_count(params) / 1e6:.1f} million parameters in {dtype} …")
         _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": dtype}, jnp.dtype(dtype))
         configuration.save(config, folder / runs.CONFIG)
         if origin:
@@ -178,24 +168,17 @@ class CardFacts:
 
 def write_card(facts: CardFacts) -> str:
     """Return the card in Markdown."""
-    sections = [
-        f"# {facts.name}",
-        _what(facts),
-        _use(facts),
-        _data(facts),
-        _training(facts),
-        _scores(facts.metrics),
-        _licence(facts),
-    ]
-    return "\n\n".join(sections) + "\n"
+    parts = [f"# {facts.name}", _what(facts), _use(facts), _data(facts), _training(facts)]
+    return "\n\n".join([*parts, _scores(facts.metrics), _licence(facts)]) + "\n"
+
+
+def _count(params: Params) -> int:
+    return sum(np.size(leaf) for leaf in jax.tree.leaves(params))
 
 
 def _what(facts: CardFacts) -> str:
     config, clip = facts.config, facts.config.model.clip
-    counts = {
-        part: sum(np.size(leaf) for leaf in jax.tree.leaves(tree))
-        for part, tree in facts.params.items()
-    }
+    counts = {part: _count(tree) for part, tree in facts.params.items()}
     rows = [f"| {part} | {count / 1e6:.2f} |" for part, count in counts.items()]
     table = "\n".join(["| part | million parameters |", "|---|---:|", *rows])
     if not isinstance(config.model, World):

@@ -5,12 +5,13 @@ published network to our parameter tree and ``write`` converts it back, tensor b
 strictly: every tensor must exist, have the right shape and be used. Names and shapes are checked
 from the table and the abstract tree before any weight is read, so errors are found early.
 ``write_world`` writes a world model's folder part by part, so that one network is in memory at a
-time. Folders are written atomically (``output.new_folder``).
+time. Folders are written atomically (``new_folder``).
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,8 +22,8 @@ import numpy as np
 
 from pewm_jax import config as configuration
 from pewm_jax.config import Config, UserError
-from pewm_jax.convert import output
-from pewm_jax.io import sources, tensor_files, tree
+from pewm_jax.io import atomic, sources, tensor_files, tree
+from pewm_jax.io.progress import Meter
 from pewm_jax.io.published import Entry, Network
 from pewm_jax.io.sources import Source, renamed
 from pewm_jax.types import Array, Params
@@ -33,6 +34,7 @@ FLOATS = ("float32", "bfloat16", "float16")
 """Target dtypes of weights, by name."""
 STORED = (*FLOATS, "float64")
 """Supported dtypes of stored weights; a table computed by a network can be float64."""
+_MEGABYTE = 1 << 20
 Specs = dict[str, jax.ShapeDtypeStruct]
 """Shape and dtype of every leaf, by path."""
 Part = tuple[Specs, Callable[[], Params]]
@@ -43,12 +45,55 @@ _LISTED = 200
 of them."""
 
 
+def refuse_existing(dst: Path) -> None:
+    """Raise an error if a path exists.
+
+    Raises:
+        UserError: ``dst`` exists.
+    """
+    if dst.exists() or dst.is_symlink():
+        raise UserError(f"{dst} exists already; choose a new folder or remove that one.")
+
+
+@contextlib.contextmanager
+def new_folder(dst: Path) -> Iterator[Path]:
+    """Write a folder under a temporary name and rename it when it is complete.
+
+    If writing fails, no folder is left.
+
+    Raises:
+        UserError: ``dst`` exists.
+    """
+    refuse_existing(dst)
+    with atomic.replacing(dst) as partial:
+        partial.mkdir(parents=True)
+        yield partial
+
+
+@contextlib.contextmanager
+def megabytes(label: str, total: int) -> Iterator[Callable[[int], None]]:
+    """Show progress in megabytes of ``total`` bytes; yields a function that adds finished bytes."""
+    done = 0
+    with Meter(label, -(-total // _MEGABYTE), "MiB") as meter:
+
+        def advance(count: int) -> None:
+            nonlocal done
+            before, done = done, done + count
+            if whole := done // _MEGABYTE - before // _MEGABYTE:
+                meter.advance(whole)
+
+        yield advance
+
+
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
+    """Write a JSON table as diffusers does: sorted keys."""
+    path.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
 def read(network: Network, folder: str | Path, dtype: str | None = None) -> tuple[Any, Params]:
-    """Read a published network.
+    """Read a published network from a pipeline's folder, or from the network's folder in it.
 
     Args:
-        network: the network, from ``models.<family>.convert``.
-        folder: a pipeline's folder, or the network's folder in it.
         dtype: dtype of the parameters, ``float32``, ``bfloat16`` or ``float16``; by default the
             stored one.
 
@@ -59,10 +104,8 @@ def read(network: Network, folder: str | Path, dtype: str | None = None) -> tupl
         UserError: a tensor is missing, unexpected or of another shape, a file is damaged, or a
             class or setting is unknown.
     """
-    config, files = _open(network, Path(folder))
-    total = tensor_files.size(files.tensors)
-    with output.megabytes(f"read {network.folder}", total) as progress:
-        source = _used(network, files)
+    config, source, total = _open(network, Path(folder))
+    with megabytes(f"read {network.folder}", total) as progress:
         like = network.like(config)
         return config, read_tensors(network.entries(config), source, like, dtype, progress)
 
@@ -81,8 +124,8 @@ def published_config(network: Network, folder: Path) -> dict[str, Any]:
 
 def specs(network: Network, folder: Path, dtype: str | None = None) -> Specs:
     """Return shape and dtype of every leaf that ``read`` will return, by path; check the files."""
-    config, files = _open(network, folder)
-    entries, like, source = network.entries(config), network.like(config), _used(network, files)
+    config, source, _ = _open(network, folder)
+    entries, like = network.entries(config), network.like(config)
     require(entries, source, like)
     return leaf_specs(entries, source, like, dtype)
 
@@ -97,20 +140,14 @@ def write(
 ) -> None:
     """Write a network in the format of the library that published it; the inverse of ``read``.
 
-    Settings that only change how the network is computed are not written.
-
-    Args:
-        network: the network.
-        config: our settings.
-        params: our parameters.
-        folder: the folder to create.
-        dtype: dtype of the tensors; by default that of the parameters.
+    Settings that only change how the network is computed are not written. By default tensors have
+    the dtype of the parameters.
 
     Raises:
         UserError: the folder exists.
     """
     values = network.write_config(config)
-    with output.new_folder(Path(folder)) as whole:
+    with new_folder(Path(folder)) as whole:
         write_published(network, values, params, whole, dtype)
 
 
@@ -121,44 +158,29 @@ def write_published(
     folder: Path,
     dtype: str | None = None,
 ) -> None:
-    """Write settings in their published form, and weights, into a folder.
-
-    Args:
-        network: the network.
-        values: its settings in their published form.
-        params: our parameters.
-        folder: the folder to create, or an empty one.
-        dtype: dtype of the tensors; by default that of the parameters.
-    """
+    """Write settings in their published form, ``values``, and weights into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    output.write_json(folder / CONFIG, values)
+    write_json(folder / CONFIG, values)
     entries = network.entries(network.config(values, "base.json"))
     announced = published_specs(entries, params, dtype)
     tensors = write_tensors(entries, params, dtype)
     path = folder / network.weights_file
-    with output.megabytes(f"write {network.folder}", tensor_files.size(announced)) as progress:
+    with megabytes(f"write {network.folder}", tensor_files.size(announced)) as progress:
         tensor_files.write(path, announced, tensors, {"format": "pt"}, progress)
 
 
-def _open(network: Network, folder: Path) -> tuple[Any, Source]:
-    """Return the settings and the files of a network, without reading weights."""
+def _open(network: Network, folder: Path) -> tuple[Any, Source, int]:
+    """Return a network's settings, the tensors that it uses, and their bytes; reads no weights."""
     config = read_config(network, folder)
-    return config, sources.open_folder(sources.component(folder, network.folder))
-
-
-def _used(network: Network, files: Source) -> Source:
-    """Return the tensors, except those that no network uses."""
-    if not network.unused:
-        return files
-    return renamed(files, {n: (n, 0, 1) for n in files.names() if n not in network.unused})
+    files = sources.open_folder(sources.component(folder, network.folder))
+    used = {name: (name, 0, 1) for name in files.names() if name not in network.unused}
+    return config, renamed(files, used), tensor_files.size(files.tensors)
 
 
 def expected(entries: Sequence[Entry], like: Params) -> dict[str, tuple[int, ...]]:
     """Return the published names and shapes of the entries, without allocating memory.
 
-    Args:
-        entries: the converter's table.
-        like: our tree, abstract (``jax.eval_shape``) or not.
+    ``like`` is our tree, abstract (``jax.eval_shape``) or not.
 
     Raises:
         ValueError: the table and the tree do not fit: a leaf (or a layer of one) without an
@@ -232,15 +254,10 @@ def read_tensors(
     Memory: the tree, and one tensor.
 
     Args:
-        entries: the converter's table.
-        source: the published tensors.
         like: our tree, abstract (``jax.eval_shape``) or not: paths and shapes.
         dtype: dtype of the result, one of ``FLOATS``; by default the stored one (for several in one
             leaf, their common dtype).
         progress: called after every tensor with the number of bytes read.
-
-    Returns:
-        Nested dictionaries of NumPy arrays.
 
     Raises:
         UserError: names or shapes do not fit, a damaged file, or a value too large for float16.
@@ -276,10 +293,7 @@ def write_tensors(
 ) -> Iterator[tuple[str, Array]]:
     """Yield the published tensors of our tree, one by one: the inverse of ``read_tensors``.
 
-    Args:
-        entries: the converter's table.
-        params: our tree, NumPy or JAX arrays.
-        dtype: dtype of the tensors; by default that of the leaves.
+    By default tensors have the dtype of the leaves.
 
     Raises:
         UserError: a value too large for float16.
@@ -342,11 +356,7 @@ def write_world(
 ) -> None:
     """Write a world model's ``config.json`` and ``weights.safetensors``, atomically.
 
-    Args:
-        dst: the folder to create.
-        config: the settings.
-        parts: name in a world model → part.
-        more: further JSON files by name.
+    ``parts`` are by their names in a world model, ``more`` are further JSON files by name.
 
     Raises:
         UserError: ``dst`` exists.
@@ -358,22 +368,17 @@ def write_world(
             for path, leaf in tree.flatten({part: make()}).items():
                 yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
 
-    with output.new_folder(dst) as folder:
+    with new_folder(dst) as folder:
         header = tensor_files.header({"stage": "0"})
-        with output.megabytes(f"write {dst.name}", tensor_files.size(specs)) as progress:
+        with megabytes(f"write {dst.name}", tensor_files.size(specs)) as progress:
             tensor_files.write(folder / WEIGHTS, specs, tensors(), header, progress)
         configuration.save(config, folder / CONFIG)
         for name, values in (more or {}).items():
-            output.write_json(folder / name, values)
+            write_json(folder / name, values)
 
 
 def fresh_actions(config: Config, dtype: str | None) -> Part:
-    """Return new layers for the control's actions, which have no effect until they are trained.
-
-    Args:
-        config: the settings.
-        dtype: dtype of the weights; by default float32.
-    """
+    """Return new layers for the control's actions, which have no effect until they are trained."""
 
     def make() -> Params:
         return jax.jit(config.model.control.init, static_argnums=0)(config.model, jax.random.key(0))

@@ -16,7 +16,7 @@ what the published models use. References, all of diffusers:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +45,9 @@ class Scheduler:
 
 
 def read(scheduler: Scheduler, folder: str | Path) -> Any:
-    """Read the scheduler of a checkpoint.
+    """Read the scheduler of a checkpoint: settings only, it has no weights.
 
     Args:
-        scheduler: the family's scheduler.
         folder: a diffusers pipeline's folder, or the scheduler's folder in it.
 
     Raises:
@@ -63,6 +62,33 @@ def published_config(scheduler: Scheduler, folder: Path) -> dict[str, Any]:
     return sources.read_config(path, scheduler.classes)
 
 
+WHAT = "The scheduler"
+
+
+def _require_class(values: Mapping[str, Any], classes: Collection[str]) -> str:
+    name = values.get("_class_name")
+    if not isinstance(name, str) or name not in classes:
+        raise UserError(f"{WHAT}'s _class_name is {name!r}; supported are {' and '.join(classes)}.")
+    return name
+
+
+def _settings(kind: type, values: dict[str, Any]) -> Any:
+    """Return our settings, or refuse the scheduler."""
+    try:
+        return configuration.from_dict(kind, values, "scheduler")
+    except ConfigError as error:
+        raise UserError(f"{WHAT} cannot be used: {error}") from None
+
+
+def _require_ours(config: Any, only: Mapping[str, Any], who: str) -> None:
+    """Refuse settings of ours that have no equivalent in the reference."""
+    for key, value in only.items():
+        if getattr(config, key) != value:
+            raise UserError(
+                f"noise.{key} is {getattr(config, key)!r}; {who} supports only {value!r}."
+            )
+
+
 COGVIDEOX_CLASSES = {"CogVideoXDDIMScheduler": "ddim", "CogVideoXDPMScheduler": "dpm"}
 """diffusers' class → our sampler."""
 TARGETS = {"epsilon": "eps", "sample": "x0", "v_prediction": "v"}
@@ -71,19 +97,17 @@ COGVIDEOX_STEPS = 50
 """Steps of an imported scheduler: the default of CogVideoX's pipelines, because no file states
 it."""
 
-_COGVIDEOX_DEFAULTS: dict[str, Any] = {
-    "num_train_timesteps": 1000,
-    "beta_start": 0.00085,
-    "beta_end": 0.012,
-    "beta_schedule": "scaled_linear",
-    "trained_betas": None,
-    "set_alpha_to_one": True,
-    "steps_offset": 0,
-    "prediction_type": "epsilon",
-    "timestep_spacing": "leading",
-    "rescale_betas_zero_snr": False,
-    "snr_shift_scale": 3.0,
+_COGVIDEOX_FIELDS: dict[str, tuple[str, Any]] = {
+    "num_train_timesteps": ("train_steps", 1000),
+    "beta_start": ("beta_start", 0.00085),
+    "beta_end": ("beta_end", 0.012),
+    "set_alpha_to_one": ("set_alpha_to_one", True),
+    "steps_offset": ("steps_offset", 0),
+    "timestep_spacing": ("spacing", "leading"),
+    "rescale_betas_zero_snr": ("zero_terminal_snr", False),
+    "snr_shift_scale": ("snr_shift", 3.0),
 }
+"""Their setting → our field, and what diffusers takes for one that a file leaves out."""
 _COGVIDEOX_FIXED = {"beta_schedule": "scaled_linear", "trained_betas": None}
 _COGVIDEOX_WITHOUT_EFFECT = {
     "clip_sample": False,
@@ -91,22 +115,10 @@ _COGVIDEOX_WITHOUT_EFFECT = {
     "sample_max_value": 1.0,
 }
 """Settings that the reference accepts but never uses."""
-_KINDS = {
-    "num_train_timesteps": int,
-    "steps_offset": int,
-    "beta_start": float,
-    "beta_end": float,
-    "snr_shift_scale": float,
-    "set_alpha_to_one": bool,
-    "rescale_betas_zero_snr": bool,
-}
 
 
 def cogvideox_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
     """Read the settings of ``scheduler/scheduler_config.json``.
-
-    Args:
-        values: the file's content.
 
     Returns:
         The sampler with the same steps: ``stride`` is ``fixed`` and ``sample_steps`` 50, as in
@@ -115,92 +127,45 @@ def cogvideox_from_diffusers(values: Mapping[str, Any]) -> DDPMConfig:
     Raises:
         UserError: another class, an unknown setting, or an unsupported value.
     """
-    name = values.get("_class_name")
-    if not isinstance(name, str) or name not in COGVIDEOX_CLASSES:
-        raise UserError(
-            f"The scheduler's _class_name is {name!r}; supported are "
-            f"{' and '.join(COGVIDEOX_CLASSES)}."
-        )
-    known = _COGVIDEOX_DEFAULTS.keys() | _COGVIDEOX_WITHOUT_EFFECT.keys()
-    published.require_known(values, "The scheduler", known)
-    values = {key: values.get(key, default) for key, default in _COGVIDEOX_DEFAULTS.items()}
-    _require_supported(values)
+    name = _require_class(values, COGVIDEOX_CLASSES)
+    checked = {**published.defaults(_COGVIDEOX_FIELDS), "prediction_type": "epsilon"}
+    defaults = {**checked, **_COGVIDEOX_FIXED}
+    published.require_known(values, WHAT, {*defaults, *_COGVIDEOX_WITHOUT_EFFECT})
+    given = {key: values.get(key, default) for key, default in defaults.items()}
+    published.require_only(given, WHAT, _COGVIDEOX_FIXED)
+    published.require_choice(given, WHAT, "prediction_type", tuple(TARGETS))
+    spacings = ("trailing", "leading", "linspace")
+    published.require_choice(given, WHAT, "timestep_spacing", spacings)
+    published.require_kinds(given, WHAT, checked)
     ours = {
-        "train_steps": values["num_train_timesteps"],
-        "beta_start": values["beta_start"],
-        "beta_end": values["beta_end"],
-        "snr_shift": values["snr_shift_scale"],
-        "zero_terminal_snr": values["rescale_betas_zero_snr"],
-        "target": TARGETS[values["prediction_type"]],
-        "sample_steps": min(COGVIDEOX_STEPS, values["num_train_timesteps"]),
+        **published.read_fields(_COGVIDEOX_FIELDS, given),
+        "target": TARGETS[given["prediction_type"]],
+        "sample_steps": min(COGVIDEOX_STEPS, given["num_train_timesteps"]),
         "sampler": COGVIDEOX_CLASSES[name],
-        "spacing": values["timestep_spacing"],
-        "steps_offset": values["steps_offset"],
         "stride": "fixed",
-        "set_alpha_to_one": values["set_alpha_to_one"],
     }
-    try:
-        return configuration.from_dict(DDPMConfig, ours, "scheduler")
-    except ConfigError as error:
-        raise UserError(f"The scheduler cannot be used: {error}") from None
+    return _settings(DDPMConfig, ours)
 
 
 def cogvideox_to_diffusers(config: DDPMConfig) -> dict[str, Any]:
-    """Return the settings in the format of ``scheduler_config.json``; the inverse of reading.
-
-    Settings without an equivalent are omitted: the number of steps and the guidance, which
-    diffusers' pipelines take as arguments, and those that only training needs.
-    """
+    """Return the settings in the format of ``scheduler_config.json``; the inverse of reading."""
     names = {ours: theirs for theirs, ours in COGVIDEOX_CLASSES.items()}
     targets = {ours: theirs for theirs, ours in TARGETS.items()}
     return {
         "_class_name": names[config.sampler],
-        "num_train_timesteps": config.train_steps,
-        "beta_start": config.beta_start,
-        "beta_end": config.beta_end,
+        **published.write_fields(_COGVIDEOX_FIELDS, config),
         "prediction_type": targets[config.target],
-        "rescale_betas_zero_snr": config.zero_terminal_snr,
-        "set_alpha_to_one": config.set_alpha_to_one,
-        "snr_shift_scale": config.snr_shift,
-        "steps_offset": config.steps_offset,
-        "timestep_spacing": config.spacing,
         **_COGVIDEOX_FIXED,
         **_COGVIDEOX_WITHOUT_EFFECT,
     }
-
-
-def _require_supported(values: Mapping[str, Any]) -> None:
-    """Raise an error for values that the reference or this library does not support."""
-    for key, value in _COGVIDEOX_FIXED.items():
-        if values[key] != value:
-            raise UserError(
-                f"The scheduler's {key} is {values[key]!r}; only {value!r} is supported."
-            )
-    choices = {
-        "prediction_type": tuple(TARGETS),
-        "timestep_spacing": ("trailing", "leading", "linspace"),
-    }
-    for key, known in choices.items():
-        if values[key] not in known:
-            raise UserError(
-                f"The scheduler's {key} is {values[key]!r}; supported are {', '.join(known)}."
-            )
-    for key, kind in _KINDS.items():
-        value = values[key]
-        number = isinstance(value, int) and not isinstance(value, bool)
-        fits = number or isinstance(value, float) if kind is float else type(value) is kind
-        if not fits:
-            raise UserError(
-                f"The scheduler's {key} is {value!r}; it must be of type {kind.__name__}."
-            )
 
 
 SVD_CLASS = "EulerDiscreteScheduler"
 """The reference's class."""
 SVD_STEPS = 25
 """Steps of an imported scheduler: the default of the pipeline, because no file states it."""
-RHO = 7.0
-"""Exponent of the levels; the reference has no setting for it."""
+_SVD_OURS: dict[str, Any] = {"target": "v", "sigma_data": 1.0, "rho": 7.0}
+"""What the reference has no setting for, in our settings."""
 _SVD_ONLY: dict[str, tuple[Any, Any]] = {
     "prediction_type": ("v_prediction", "epsilon"),
     "timestep_type": ("continuous", "discrete"),
@@ -229,9 +194,6 @@ _SVD_FORMER = ("clip_sample", "set_alpha_to_one", "skip_prk_steps")
 def svd_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
     """Read the settings of ``scheduler/scheduler_config.json``.
 
-    Args:
-        values: the file's content.
-
     Returns:
         The sampler with the same steps, 25 of them; settings that are not in the file, such as the
         noise in training, have our defaults.
@@ -239,46 +201,25 @@ def svd_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
     Raises:
         UserError: another class, an unknown setting, or an unsupported value.
     """
-    name = values.get("_class_name")
-    if name != SVD_CLASS:
-        raise UserError(f"The scheduler's _class_name is {name!r}; supported is {SVD_CLASS}.")
-    known = {"sigma_min", "sigma_max", *_SVD_ONLY, *_SVD_WITHOUT_EFFECT, *_SVD_FORMER}
-    published.require_known(values, "The scheduler", known)
-    for key, (only, default) in _SVD_ONLY.items():
-        if (value := values.get(key, default) or default) != only:
-            raise UserError(f"The scheduler's {key} is {value!r}; only {only!r} is supported.")
-    ours: dict[str, Any] = {
-        "target": "v",
-        "sigma_data": 1.0,
-        "rho": RHO,
-        "sample_steps": SVD_STEPS,
-    }
-    for key in ("sigma_min", "sigma_max"):
-        value = values.get(key)
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise UserError(f"The scheduler's {key} is {value!r}; it must be a number.")
-        ours[key] = float(value)
-    try:
-        return configuration.from_dict(EDMConfig, ours, "scheduler")
-    except ConfigError as error:
-        raise UserError(f"The scheduler cannot be used: {error}") from None
+    _require_class(values, [SVD_CLASS])
+    levels = ("sigma_min", "sigma_max")
+    known = {*levels, *_SVD_ONLY, *_SVD_WITHOUT_EFFECT, *_SVD_FORMER}
+    published.require_known(values, WHAT, known)
+    given = {key: values.get(key) or default for key, (_, default) in _SVD_ONLY.items()}
+    published.require_only(given, WHAT, {key: only for key, (only, _) in _SVD_ONLY.items()})
+    found: dict[str, Any] = {key: values.get(key) for key in levels}
+    published.require_kinds(found, WHAT, {"sigma_min": 0.002, "sigma_max": 700.0})
+    ours = {**_SVD_OURS, **{key: float(value) for key, value in found.items()}}
+    return _settings(EDMConfig, {**ours, "sample_steps": SVD_STEPS})
 
 
 def svd_to_diffusers(config: EDMConfig) -> dict[str, Any]:
     """Return the settings in the format of ``scheduler_config.json``; the inverse of reading.
 
-    The number of steps, the guidance and the noise in training are omitted: diffusers has no
-    settings for them.
-
     Raises:
         UserError: a setting has no equivalent in the reference.
     """
-    wanted = {"target": "v", "sigma_data": 1.0, "rho": RHO, "sampler": "euler"}
-    for key, only in wanted.items():
-        if getattr(config, key) != only:
-            raise UserError(
-                f"noise.{key} is {getattr(config, key)!r}; {SVD_CLASS} supports only {only!r}."
-            )
+    _require_ours(config, {**_SVD_OURS, "sampler": "euler"}, SVD_CLASS)
     return {
         "_class_name": SVD_CLASS,
         "sigma_min": config.sigma_min,
@@ -290,7 +231,6 @@ def svd_to_diffusers(config: EDMConfig) -> dict[str, Any]:
 
 COSMOS_CLASS = "FlowMatchEulerDiscreteScheduler"
 """The reference's class."""
-WHAT = "The scheduler"
 COSMOS_STEPS = 35
 """Steps of an imported scheduler: the default of the pipeline, because no file states it."""
 _COSMOS_OURS: dict[str, Any] = {
@@ -331,9 +271,6 @@ _COSMOS_WITHOUT_EFFECT: dict[str, Any] = {
 def cosmos_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
     """Read the settings of ``scheduler/scheduler_config.json``.
 
-    Args:
-        values: the file's content.
-
     Returns:
         The sampler with the same steps, 35 of them; settings that are not in the file, such as the
         noise in training, have our defaults. The pipeline's ``guidance_scale`` g is ``guidance``
@@ -351,17 +288,10 @@ def cosmos_from_diffusers(values: Mapping[str, Any]) -> EDMConfig:
 def cosmos_to_diffusers(config: EDMConfig) -> dict[str, Any]:
     """Return the settings in the format of ``scheduler_config.json``; the inverse of reading.
 
-    The number of steps, the guidance and the noise in training are omitted: diffusers has no
-    settings for them.
-
     Raises:
         UserError: a setting has no equivalent in the pipeline.
     """
-    for key, only in {**_COSMOS_OURS, "sampler": "euler"}.items():
-        if getattr(config, key) != only:
-            raise UserError(
-                f"noise.{key} is {getattr(config, key)!r}; Cosmos-Predict2 supports only {only!r}."
-            )
+    _require_ours(config, {**_COSMOS_OURS, "sampler": "euler"}, "Cosmos-Predict2")
     return {
         "_class_name": COSMOS_CLASS,
         **{key: only for key, (only, _) in _COSMOS_ONLY.items()},

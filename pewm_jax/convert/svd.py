@@ -9,79 +9,36 @@ are trained.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Literal
 
 from pewm_jax.config import Config
-from pewm_jax.convert import output, pipeline, schedulers
-from pewm_jax.diffusion.edm import EDMConfig
-from pewm_jax.models.clip.config import CLIPVisionConfig
+from pewm_jax.convert import pipeline, schedulers
 from pewm_jax.models.clip.convert import IMAGE_ENCODER
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.convert import UNET, VAE
-from pewm_jax.models.svd.vae_codec import SVDVAECodec
-from pewm_jax.types import Params
 from pewm_jax.worlds.egowm import paper as egowm_paper
 
-
-def read_unet(folder: str | Path, dtype: str | None = None) -> tuple[SVDUNetBackbone, Params]:
-    """Read the U-Net for ``pewm_jax.models.svd.unet.apply``; see ``pipeline.read``."""
-    return pipeline.read(UNET, folder, dtype)
-
-
-def write_unet(
-    config: SVDUNetBackbone, params: Params, folder: str | Path, dtype: str | None = None
-) -> None:
-    """Write the U-Net for diffusers' ``from_pretrained``; see ``pipeline.write``."""
-    pipeline.write(UNET, config, params, folder, dtype)
-
-
-def read_vae(folder: str | Path, dtype: str | None = None) -> tuple[SVDVAECodec, Params]:
-    """Read the autoencoder for ``pewm_jax.models.svd.vae``; see ``pipeline.read``."""
-    return pipeline.read(VAE, folder, dtype)
-
-
-def write_vae(
-    config: SVDVAECodec, params: Params, folder: str | Path, dtype: str | None = None
-) -> None:
-    """Write the autoencoder for diffusers' ``from_pretrained``; see ``pipeline.write``."""
-    pipeline.write(VAE, config, params, folder, dtype)
-
-
-def read_image_encoder(
-    folder: str | Path, dtype: str | None = None
-) -> tuple[CLIPVisionConfig, Params]:
-    """Read the image encoder for ``pewm_jax.models.clip.model.apply``; see ``pipeline.read``."""
-    return pipeline.read(IMAGE_ENCODER, folder, dtype)
-
-
-def write_image_encoder(
-    config: CLIPVisionConfig, params: Params, folder: str | Path, dtype: str | None = None
-) -> None:
-    """Write the image encoder for transformers' ``from_pretrained``."""
-    pipeline.write(IMAGE_ENCODER, config, params, folder, dtype)
-
-
-def read_scheduler(folder: str | Path) -> EDMConfig:
-    """Read the scheduler of a checkpoint: settings only, it has no weights.
-
-    Args:
-        folder: a diffusers pipeline's folder, or the scheduler's folder in it.
-
-    Raises:
-        UserError: a class or setting is unknown.
-    """
-    return schedulers.read(schedulers.SVD, folder)
+read_unet = functools.partial(pipeline.read, UNET)
+"""Read the U-Net for ``pewm_jax.models.svd.unet.apply``; see ``pipeline.read``."""
+write_unet = functools.partial(pipeline.write, UNET)
+"""Write the U-Net for diffusers' ``from_pretrained``; see ``pipeline.write``."""
+read_vae = functools.partial(pipeline.read, VAE)
+"""Read the autoencoder for ``pewm_jax.models.svd.vae``; see ``pipeline.read``."""
+write_vae = functools.partial(pipeline.write, VAE)
+"""Write the autoencoder for diffusers' ``from_pretrained``; see ``pipeline.write``."""
+read_image_encoder = functools.partial(pipeline.read, IMAGE_ENCODER)
+"""Read the image encoder for ``pewm_jax.models.clip.model.apply``; see ``pipeline.read``."""
+write_image_encoder = functools.partial(pipeline.write, IMAGE_ENCODER)
+"""Write the image encoder for transformers' ``from_pretrained``; see ``pipeline.write``."""
+read_scheduler = functools.partial(schedulers.read, schedulers.SVD)
+"""Read the scheduler of a checkpoint, an ``EDMConfig``; see ``schedulers.read``."""
 
 
 def config_of(src: Path, dst: Path, dtype: str | None, size: tuple[int, int]) -> Config:
     """Return the settings of the world model around a pipeline's networks.
 
-    Args:
-        src: the pipeline's folder.
-        dst: the folder to create; runs get its name.
-        dtype: dtype of the weights; 16-bit weights are computed in bfloat16.
-        size: height and width of a frame.
+    16-bit weights are computed in bfloat16. ``size`` is the height and width of a frame.
 
     Raises:
         UserError: a network of another class, or unknown settings.
@@ -104,11 +61,10 @@ def config_of(src: Path, dst: Path, dtype: str | None, size: tuple[int, int]) ->
 def import_world(
     src: Path, dst: Path, dtype: str | None = None, size: tuple[int, int] = (512, 512)
 ) -> None:
-    """Write the folder: ``config.json`` and ``weights.safetensors``.
+    """Write a world model's folder: ``config.json`` and ``weights.safetensors``.
 
     Args:
         src: a pipeline's folder in diffusers' layout: unet/, vae/, image_encoder/, scheduler/.
-        dst: the folder to create.
         dtype: dtype of the weights; by default the stored one, and float32 for the actions' layers.
         size: height and width of a frame.
 
@@ -116,7 +72,7 @@ def import_world(
         UserError: ``dst`` exists, or ``src`` is incomplete, damaged or of another type.
         ConfigError: the networks do not fit each other or the size.
     """
-    output.refuse_existing(dst)
+    pipeline.refuse_existing(dst)
     stored = dtype or pipeline.specs(UNET, src)["conv_out/kernel"].dtype.name
     config = config_of(src, dst, stored, size)
     parts: dict[str, pipeline.Part] = {

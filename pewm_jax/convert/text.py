@@ -7,14 +7,17 @@ padding are zeros.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from pewm_jax.convert import output
 from pewm_jax.errors import UserError
 from pewm_jax.io import sources, tree
+
+_UNREADABLE = (OSError, ValueError, KeyError, TypeError, ImportError, AttributeError, RuntimeError)
+"""What transformers raises for a folder that it cannot read."""
 
 
 def encode(
@@ -23,8 +26,6 @@ def encode(
     """Encode prompts with the ``text_encoder/`` and ``tokenizer/`` of a pipeline's folder.
 
     Args:
-        src: the pipeline's folder.
-        prompts: the prompts; the empty one is a prompt too.
         length: text tokens L of the transformer: 226 or 224, in Cosmos 512.
         width: channels of a text token.
         masked: whether padding is masked in the encoder, and its tokens are zeros (Cosmos).
@@ -56,21 +57,20 @@ def encode(
 def _encode(
     encoder: Path, tokenizer: Path, prompts: Sequence[str], length: int, *, masked: bool
 ) -> dict[str, np.ndarray]:
-    torch, transformers = output.convert_extra("torch"), output.convert_extra("transformers")
     try:
-        tokenize = transformers.AutoTokenizer.from_pretrained(tokenizer, local_files_only=True)
-    except (OSError, ValueError, KeyError, TypeError, ImportError, AttributeError) as error:
+        import torch  # noqa: PLC0415 - an extra
+        import transformers  # noqa: PLC0415 - an extra
+    except ImportError as error:
         raise UserError(
-            f"{tokenizer} cannot be read as a tokenizer ({_first_sentence(error)})."
+            f"Prompts are encoded by torch and transformers, which cannot be imported ({error}); "
+            "run pip install 'pewm-jax[convert]'."
         ) from None
-    try:
+    with _reading(tokenizer, "a tokenizer"):
+        tokenize = transformers.AutoTokenizer.from_pretrained(tokenizer, local_files_only=True)
+    with _reading(encoder, "a T5 encoder"):
         model, report = transformers.T5EncoderModel.from_pretrained(
             encoder, local_files_only=True, dtype="auto", output_loading_info=True
         )
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise UserError(
-            f"{encoder} cannot be read as a T5 encoder ({_first_sentence(error)})."
-        ) from None
     wrong = {*report["missing_keys"], *report["unexpected_keys"]}
     if wrong:
         raise UserError(
@@ -101,7 +101,11 @@ def _encode(
     return out
 
 
-def _first_sentence(error: Exception) -> str:
-    """Return the first sentence of a library's message."""
-    lines = str(error).strip().splitlines() or [type(error).__name__]
-    return lines[0].rstrip(".:")
+@contextlib.contextmanager
+def _reading(folder: Path, what: str) -> Iterator[None]:
+    """Turn the errors of transformers into one sentence."""
+    try:
+        yield
+    except _UNREADABLE as error:
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        raise UserError(f"{folder} cannot be read as {what} ({lines[0].rstrip('.:')}).") from None

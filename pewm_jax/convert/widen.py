@@ -41,7 +41,6 @@ def plan(old: DiTBackbone, latents: int, camera: int) -> Widening:
     """Map each channel of the video model to one of the world model.
 
     Args:
-        old: the video model's transformer.
         latents: latent channels of the VAE.
         camera: camera channels at the latent rate.
 
@@ -52,8 +51,7 @@ def plan(old: DiTBackbone, latents: int, camera: int) -> Widening:
         raise UserError(
             f"The transformer has {old.in_channels} input and {old.out_channels} output channels; "
             f"with a VAE of {latents} it must have {latents} (text to video) or {2 * latents} "
-            "(image "
-            f"to video) inputs and {latents} outputs."
+            f"(image to video) inputs and {latents} outputs."
         )
     noisy = tuple(range(latents))
     image = tuple(range(2 * latents, 3 * latents))[: old.in_channels - latents]

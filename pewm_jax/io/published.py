@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -108,21 +108,75 @@ class Network:
             raise UserError(f"{where}: {error}") from None
 
 
+def patches(patch: int) -> Transform:
+    """Return torch (D, 3, p, p), a convolution of a picture's patches ↔ ours (p·p·3, D)."""
+    return Transform(
+        lambda x: np.moveaxis(x, (1, 0), (2, 3)).reshape(patch * patch * 3, -1),
+        lambda x: np.moveaxis(x.reshape(patch, patch, 3, -1), (2, 3), (1, 0)),
+    )
+
+
+def affine(
+    theirs: str, ours: str, layer: int | None = None, transform: Transform = LINEAR
+) -> Iterator[Entry]:
+    """Yield the entries of a linear layer, or of another one with a kernel and a bias."""
+    yield Entry(f"{theirs}.weight", f"{ours}/kernel", transform, layer)
+    yield Entry(f"{theirs}.bias", f"{ours}/bias", SAME, layer)
+
+
+def norm(theirs: str, ours: str, layer: int | None = None) -> Iterator[Entry]:
+    """Yield the entries of a norm."""
+    yield Entry(f"{theirs}.weight", f"{ours}/scale", SAME, layer)
+    yield Entry(f"{theirs}.bias", f"{ours}/bias", SAME, layer)
+
+
+Fields = Mapping[str, tuple[str, Any]]
+"""Published setting → our field, and the default of the class that published it."""
+
+
+def defaults(fields: Fields) -> dict[str, Any]:
+    """Return the defaults by the settings' published names."""
+    return {theirs: default for theirs, (_, default) in fields.items()}
+
+
+def read_fields(fields: Fields, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return our fields: lists become tuples, and whole numbers floats where the default is one."""
+    return {name: _ours(given[key], default) for key, (name, default) in fields.items()}
+
+
+def write_fields(fields: Fields, config: Any) -> dict[str, Any]:
+    """Return the published settings of our configuration; the inverse of ``read_fields``."""
+    values = {key: getattr(config, name) for key, (name, _) in fields.items()}
+    return {key: _plain(value) for key, value in values.items()}
+
+
+TRANSFORMERS_METADATA = (
+    "architectures",
+    "model_type",
+    "torch_dtype",
+    "dtype",
+    "transformers_version",
+    "_name_or_path",
+    "id2label",
+    "label2id",
+    "problem_type",
+    "return_dict",
+    "output_hidden_states",
+    "output_attentions",
+    "is_encoder_decoder",
+    "chunk_size_feed_forward",
+    "torchscript",
+    "use_bfloat16",
+    "initializer_range",
+)
+"""Settings in every ``config.json`` of transformers that do not change what a network computes."""
+
+
 def rename(path: str, rules: Sequence[tuple[str, Any]]) -> str:
-    """Apply regular expressions to a path, in sequence."""
-    for pattern, name in rules:
+    """Return the published name of a path: apply regular expressions, then torch's conventions."""
+    for pattern, name in (*rules, (r"/(kernel|scale)$", "/weight"), (r"[/.]+", ".")):
         path = re.sub(pattern, name, path)
     return path
-
-
-def require_class(values: Mapping[str, Any], what: str, name: str) -> None:
-    """Raise UserError if settings name another class than ``name``; they may name none.
-
-    Here and below ``values`` is the JSON object and ``what`` names it in messages: ``The U-Net``.
-    """
-    kind = values.get("_class_name", name)
-    if kind != name:
-        raise UserError(f"{what} is a {kind}; only {name} can be read.")
 
 
 def require_known(values: Mapping[str, Any], what: str, known: Collection[str]) -> None:
@@ -145,19 +199,19 @@ def read_settings(
     defaults: Mapping[str, Any],
     without_effect: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Return the settings of a network of one class, with the class's defaults for missing ones.
+    """Return the settings of a network of class ``name``, with the class's defaults.
 
     Args:
         values: the JSON object.
-        what: what they describe, for messages.
-        name: the supported class.
+        what: what they describe, for messages: ``The U-Net``.
         defaults: the settings that matter, with the class's defaults.
         without_effect: settings that are allowed and ignored.
 
     Raises:
-        UserError: another class, or an unknown setting.
+        UserError: another class, or an unknown setting. Naming no class is allowed.
     """
-    require_class(values, what, name)
+    if (kind := values.get("_class_name", name)) != name:
+        raise UserError(f"{what} is a {kind}; only {name} can be read.")
     require_known(values, what, {*defaults, *without_effect})
     return {key: values.get(key, default) for key, default in defaults.items()}
 
@@ -169,6 +223,17 @@ def require_only(given: Mapping[str, Any], what: str, only: Mapping[str, Any]) -
             raise UserError(f"{what}'s {key} is {given[key]!r}; only {value!r} is supported.")
 
 
+def require_choice(given: Mapping[str, Any], what: str, key: str, choices: Sequence[Any]) -> None:
+    """Raise an error for a setting that is none of the supported values.
+
+    Raises:
+        UserError: it has another value.
+    """
+    if given[key] not in choices:
+        names = ", ".join(map(str, choices))
+        raise UserError(f"{what}'s {key} is {given[key]!r}; supported are {names}.")
+
+
 def require_kinds(given: Mapping[str, Any], what: str, examples: Mapping[str, Any]) -> None:
     """Raise UserError for settings whose types differ from those of examples.
 
@@ -178,6 +243,12 @@ def require_kinds(given: Mapping[str, Any], what: str, examples: Mapping[str, An
     for key, example in examples.items():
         if not _same_type(given[key], example):
             raise UserError(f"{what}'s {key} is {given[key]!r}; give a value like {example!r}.")
+
+
+def _ours(value: Any, example: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return tuple(_ours(item, example[0]) for item in value)
+    return float(value) if isinstance(example, float) else value
 
 
 def _plain(value: Any) -> Any:

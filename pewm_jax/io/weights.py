@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 
 import jax
@@ -77,6 +78,26 @@ def read_others(path: Path, of: str) -> dict[str, np.ndarray]:
     if path.suffix == ".safetensors":
         return dict(tensor_files.read(path))
     return dict(tree.flatten(pickles.read(path)))
+
+
+def packaged(spec: ModuleSpec | None, name: str) -> Path | None:
+    """Return a file of weights in a package that was found, or None; it is not imported."""
+    for folder in (spec.submodule_search_locations if spec else None) or ():
+        path = Path(folder) / "weights" / name
+        if path.is_file():
+            return path
+    return None
+
+
+def require_shapes(
+    flat: Mapping[str, np.ndarray], shapes: Mapping[str, tuple[int, ...]], where: str
+) -> Params:
+    """Return the tree of arrays, in float32, if they have these paths and shapes; see ``check``."""
+    arrays = {name: np.ascontiguousarray(x, np.float32) for name, x in flat.items()}
+    like = {name: jax.ShapeDtypeStruct(shape, np.float32) for name, shape in shapes.items()}
+    params = tree.unflatten(arrays)
+    check(params, tree.unflatten(like), where)
+    return params
 
 
 def verify(path: Path) -> None:

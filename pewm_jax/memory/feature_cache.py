@@ -32,7 +32,7 @@ from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.io import tensor_files, tree, weights
 from pewm_jax.io.progress import Meter
 from pewm_jax.models.dinov2 import model as dinov2
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.types import Array, Params
 
 MANIFEST = "cache.json"

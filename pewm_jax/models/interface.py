@@ -12,6 +12,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import AssembledModel
 from pewm_jax.config.parts import Codec, Rules
+from pewm_jax.errors import UserError
 from pewm_jax.types import Array, Params
 
 
@@ -82,16 +83,9 @@ NO_READERS = Readers()
 def observed(model: AssembledModel, params: Params, seen: Observed) -> Conditioning:
     """Turn the observed frames into inputs of the backbone, by its own ways if it has any.
 
-    By default the latents are joined to the input, zero for the frames to be imagined.
-
-    Args:
-        model: the model.
-        params: the world model's parameters; those under ``image`` are the backbone's to use.
-        seen: the observed frames.
-
-    Returns:
-        Conditioning with ``settings.shown_channels(model)`` joined channels: by default as many as
-        the latents have.
+    By default the latents are joined to the input, zero for the frames to be imagined. There are
+    ``settings.shown_channels(model)`` joined channels. ``params`` are the world model's; those
+    under ``image`` are the backbone's to use.
     """
     own = model.backbone.observed(model, params, seen)
     if own is not None:
@@ -115,6 +109,24 @@ def held(conditioning: Conditioning, latents_BthwC: Array) -> Array:
         return latents_BthwC
     there = conditioning.known_Bt[:, :, None, None, None]
     return jnp.where(there, conditioning.known_BthwC, latents_BthwC)
+
+
+def require_shape(name: str, value: Array | None, forms: tuple[tuple[int | str, ...], ...]) -> None:
+    """Refuse an argument of none of these shapes; a letter means any size, and None is accepted.
+
+    Raises:
+        UserError: it has another shape.
+    """
+    if value is None or any(_fits(value.shape, form) for form in forms):
+        return
+    texts = " or ".join(f"({', '.join(map(str, form))})" for form in forms)
+    raise UserError(f"{name} has shape {tuple(value.shape)}: it must be {texts}.")
+
+
+def _fits(shape: tuple[int, ...], form: tuple[int | str, ...]) -> bool:
+    return len(form) == len(shape) and all(
+        isinstance(side, str) or side == size for side, size in zip(form, shape, strict=True)
+    )
 
 
 class PublishedVAE(Codec):

@@ -8,7 +8,7 @@ Dao et al. 2022). This saves memory and is faster than reading the weights back.
 the same formula without the loops.
 
 The target of the trace (``nn.target``) chooses the kernel: cuDNN's flash attention for NVIDIA GPUs
-in 16 bits, splash attention (``nn.splash``) for many tokens on TPUs.
+in 16 bits, JAX's Pallas kernel "splash attention" for many tokens on TPUs. Both store no logits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.errors import UserError
-from pewm_jax.nn import placement, splash
+from pewm_jax.nn import placement
 from pewm_jax.nn import target as targets
 from pewm_jax.nn.layers import linear, merge_heads, split_heads
 from pewm_jax.nn.target import Target
@@ -30,6 +30,18 @@ from pewm_jax.types import Array, Params
 
 LOGITS = 2**20
 """Logits held at once on a CPU: 4 MB in float32."""
+
+LANES = 128
+"""Channels and tokens that a TPU's vector registers hold side by side."""
+TILES = (512, 384, 256, 128)
+"""Numbers of tokens in a tile, preferred first."""
+TILE_COST = 64
+"""Assumed cost of a tile beside its work, in tokens."""
+CHANNELS = 256
+"""Largest number of channels of a head: tiles of larger heads do not fit the vector memory."""
+TOKENS = 256
+"""Fewest queries and keys for which the kernel saves memory: with fewer, the logits are about as
+large as queries and keys."""
 
 Implementation = Literal["auto", "xla", "cudnn", "splash"]
 Kernel = Literal["formula", "cudnn", "splash"]
@@ -49,9 +61,6 @@ def attention(
     keys and values of its clips and heads, and computes alone.
 
     Args:
-        q_BKND: queries.
-        k_BKMD: keys.
-        v_BKMD: values.
         implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `splash` is flash
             attention on TPUs, `xla` runs anywhere, `auto` takes the best that works.
         real_M: indices of the keys that are not padding; None if all are real.
@@ -75,7 +84,7 @@ def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implemen
     batch, heads, queries, _ = q_BKND.shape
     kernel = choose_kernel(targets.current(), q_BKND, k_BKMD, implementation)
     if kernel == "splash":
-        return splash.splash(q_BKND, k_BKMD, v_BKMD)
+        return splash(q_BKND, k_BKMD, v_BKMD)
     if kernel == "cudnn":
         q, k, v = (x.swapaxes(1, 2) for x in (q_BKND, k_BKMD, v_BKMD))
         return flash(q, k, v, "cudnn").swapaxes(1, 2)
@@ -89,12 +98,6 @@ def choose_kernel(
     target: Target, q_BKND: Any, k_BKMD: Any, implementation: Implementation = "auto"
 ) -> Kernel:
     """Return what computes attention on a target.
-
-    Args:
-        target: the hardware.
-        q_BKND: queries, or their shape and dtype.
-        k_BKMD: keys, or their shape and dtype.
-        implementation: as for ``attention``.
 
     Raises:
         UserError: a kernel is asked for that the target or these arrays do not allow.
@@ -116,7 +119,7 @@ def choose_kernel(
             f"128 channels, a multiple of 8; here are {target.platform}, {q_BKND.dtype} and "
             f"{channels}: choose auto or xla."
         )
-    pays = target.platform == "tpu" and splash.pays(queries, k_BKMD.shape[2], channels)
+    pays = target.platform == "tpu" and splash_pays(queries, k_BKMD.shape[2], channels)
     return "splash" if pays else "formula"
 
 
@@ -139,12 +142,6 @@ def flash(q_BNKD: Array, k_BMKD: Array, v_BMKD: Array, implementation: Any) -> A
 
     The gradient of cuDNN's kernel refuses odd numbers of queries or keys (jax 0.10), so these get
     one token of padding, which is masked and dropped.
-
-    Args:
-        q_BNKD: queries.
-        k_BMKD: keys.
-        v_BMKD: values.
-        implementation: of ``jax.nn.dot_product_attention``.
     """
     batch, queries, keys = *q_BNKD.shape[:2], k_BMKD.shape[1]
     if queries % 2 == 0 and keys % 2 == 0:
@@ -171,6 +168,66 @@ def fits_flash(q_BKND: Any) -> bool:
     return sixteen and channels <= 128 and channels % 8 == 0
 
 
+def splash_pays(queries: int, keys: int, channels: int) -> bool:
+    """Tell whether the kernel is better than the formula for these sizes."""
+    return min(queries, keys) >= TOKENS and channels <= CHANNELS
+
+
+def tile(tokens: int) -> int:
+    """Return the number of tokens in a tile: few tiles and little padding."""
+
+    def cost(size: int) -> float:
+        return -(-tokens // size) * (size + TILE_COST)
+
+    return min(TILES, key=cost)
+
+
+def splash(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, *, interpret: bool = False) -> Array:
+    """Compute attention (B, K, N, d) on one TPU; ``interpret`` runs the kernel anywhere, slowly.
+
+    The kernel wants heads of a multiple of 128 channels and numbers of tokens that are multiples of
+    its tiles, so both are padded with zeros. Padded keys are excluded by segment numbers. Padded
+    queries are computed and dropped.
+    """
+    from jax.experimental.pallas.ops.tpu import splash_attention as pallas  # noqa: PLC0415 - slow
+
+    shape: tuple[int, ...] = q_BKND.shape
+    _, heads, queries, channels = shape
+    keys: int = k_BKMD.shape[2]
+    rows, columns = tile(queries), tile(keys)
+    q = _padded(q_BKND * channels**-0.5, rows)
+    k, v = _padded(k_BKMD, columns), _padded(v_BKMD, columns)
+    everything = pallas.FullMask((q.shape[2], k.shape[2]))
+    kernel = pallas.make_splash_mha(
+        pallas.MultiHeadMask([everything] * heads),
+        head_shards=1,
+        q_seq_shards=1,
+        interpret=interpret,
+        block_sizes=pallas.BlockSizes(
+            block_q=rows,
+            block_kv=columns,
+            block_q_dkv=rows,
+            block_kv_dkv=columns,
+            block_q_dq=rows,
+            block_kv_dq=columns,
+        ),
+    )
+    segments = None
+    if k.shape[2] > keys:
+        padding = jnp.arange(k.shape[2]) >= keys
+        segments = pallas.SegmentIds(
+            q=jnp.zeros(q.shape[2], jnp.int32), kv=padding.astype(jnp.int32)
+        )
+    out: Any = jax.vmap(kernel, in_axes=(0, 0, 0, None))(q, k, v, segments)
+    return out[:, :, :queries, :channels]
+
+
+def _padded(x_BKNC: Array, size: int) -> Array:
+    """Pad tokens to a multiple of ``size`` and channels to a multiple of ``LANES``."""
+    *_, tokens, channels = x_BKNC.shape
+    return jnp.pad(x_BKNC, ((0, 0), (0, 0), (0, -tokens % size), (0, -channels % LANES)))
+
+
 @partial(jax.custom_vjp, nondiff_argnums=(3,))
 def _attention(q: Array, k: Array, v: Array, blocks: int) -> Array:
     return _forward(q, k, v, blocks)[0]
@@ -186,16 +243,9 @@ def _forward(q: Array, k: Array, v: Array, blocks: int) -> tuple[Array, tuple[Ar
 def _backward(blocks: int, saved: tuple[Array, ...], grad: Array) -> Any:
     q, k, v, out, normaliser = saved
     shared = (grad.astype(jnp.float32) * out.astype(jnp.float32)).sum(-1, keepdims=True)
-    return jax.lax.platform_dependent(
-        q,
-        k,
-        v,
-        normaliser,
-        shared,
-        grad,
-        cpu=partial(_pieces_backward, blocks=blocks),
-        default=_piece_backward,
-    )
+    arrays = q, k, v, normaliser, shared, grad
+    by_blocks = partial(_pieces_backward, blocks=blocks)
+    return jax.lax.platform_dependent(*arrays, cpu=by_blocks, default=_piece_backward)
 
 
 _attention.defvjp(_forward, _backward)
@@ -293,8 +343,3 @@ def _pieces_backward(
     cut = tuple(_cut(x, blocks) for x in (q, normaliser, shared, grad))
     dq, dk, dv = jax.lax.map(head, (cut, k.swapaxes(0, 1), v.swapaxes(0, 1)))
     return _join(dq, q.shape[2]), dk.swapaxes(0, 1), dv.swapaxes(0, 1)
-
-
-def in_pieces(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, blocks: int) -> Array:
-    """Compute attention in ``blocks`` blocks of queries, one head at a time, on any platform."""
-    return _pieces_forward(q_BKND, k_BKMD, v_BKMD, blocks=blocks)[0]

@@ -11,7 +11,7 @@ of videos.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -68,16 +68,11 @@ convolve.defvjp(_convolve_forward, _convolve_backward)
 def convolve_grid(x_NXYZC: Array, kernel_XYZIO: Array, form: Form = "auto") -> Array:
     """Convolve grids with a cubic kernel of odd side, with zeros around the grid.
 
-    Args:
-        x_NXYZC: grids.
-        kernel_XYZIO: the kernel, in the dtype of the grids.
-        form: how it is computed; the result is the same up to rounding.
+    The form does not change the result, up to rounding.
     """
     if kernel_XYZIO.shape[0] == 1:
         return x_NXYZC @ kernel_XYZIO[0, 0, 0]
-    if form == "auto":
-        return jax.lax.platform_dependent(x_NXYZC, kernel_XYZIO, cpu=by_products, default=by_xla)
-    return (by_xla if form == "xla" else by_products)(x_NXYZC, kernel_XYZIO)
+    return _in_form(form, by_xla, by_products, x_NXYZC, kernel_XYZIO)
 
 
 def by_xla(x_NXYZC: Array, kernel_XYZIO: Array) -> Array:
@@ -108,15 +103,18 @@ def _grid_backward(saved: tuple[Array, Array], out_NXYZO: Array) -> tuple[Array,
 by_products.defvjp(_grid_forward, _grid_backward)
 
 
-def _columns(x_NXYZC: Array, side: int) -> Array:
-    """Return (N, X, Y, Z, side³·C): what lies under the kernel at each place."""
+def _columns(x_NXYZC: Array, side: int, stride: int = 1) -> Array:
+    """Return (N, X, Y, Z, side³·C): what lies under the kernel at each place, or at every second.
+
+    It is gathered along one axis after the other.
+    """
     around = side // 2
     x = x_NXYZC
     for axis in (3, 2, 1):  # the last axis' copies lie innermost, as in the kernel
         padding = [(0, 0)] * 5
         padding[axis] = (around, around)
-        padded, count = jnp.pad(x, padding), x.shape[axis]
-        taps = [jax.lax.slice_in_dim(padded, tap, tap + count, axis=axis) for tap in range(side)]
+        padded, end = jnp.pad(x, padding), x.shape[axis] + 1 - stride
+        taps = [jax.lax.slice_in_dim(padded, k, k + end, stride, axis) for k in range(side)]
         x = jnp.concatenate(taps, -1)
     return x
 
@@ -126,12 +124,13 @@ def halve_grid(x_NXYZC: Array, kernel_XYZIO: Array, form: Form = "auto") -> Arra
 
     The places are those with even numbers, as in torch with a padding of 1. Sides are even.
     """
+    return _in_form(form, _halve_by_xla, _halve_by_products, x_NXYZC, kernel_XYZIO)
+
+
+def _in_form(form: Form, by_xla: Any, by_products: Any, *arrays: Array) -> Array:
     if form == "auto":
-        return jax.lax.platform_dependent(
-            x_NXYZC, kernel_XYZIO, cpu=_halve_by_products, default=_halve_by_xla
-        )
-    halve = _halve_by_xla if form == "xla" else _halve_by_products
-    return halve(x_NXYZC, kernel_XYZIO)
+        return jax.lax.platform_dependent(*arrays, cpu=by_products, default=by_xla)
+    return (by_xla if form == "xla" else by_products)(*arrays)
 
 
 def _halve_by_xla(x_NXYZC: Array, kernel_XYZIO: Array) -> Array:
@@ -141,12 +140,4 @@ def _halve_by_xla(x_NXYZC: Array, kernel_XYZIO: Array) -> Array:
 
 
 def _halve_by_products(x_NXYZC: Array, kernel_XYZIO: Array) -> Array:
-    """Gather every second place's columns, along one axis after the other."""
-    x = x_NXYZC
-    for axis in (3, 2, 1):
-        padding = [(0, 0)] * 5
-        padding[axis] = (1, 1)
-        padded, count = jnp.pad(x, padding), x.shape[axis]
-        taps = [jax.lax.slice_in_dim(padded, tap, tap + count - 1, 2, axis) for tap in range(3)]
-        x = jnp.concatenate(taps, -1)
-    return x @ kernel_XYZIO.reshape(-1, kernel_XYZIO.shape[-1])
+    return _columns(x_NXYZC, 3, 2) @ kernel_XYZIO.reshape(-1, kernel_XYZIO.shape[-1])

@@ -7,8 +7,9 @@ Initialisation and the import of published weights both use such a table. A conv
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,28 @@ def linear(where: str, inward: int, outward: int) -> Iterator[Leaf]:
     yield from convolution(where, (), inward, outward)
 
 
+def mlp(where: str, inward: int, hidden: int, outward: int) -> Iterator[Leaf]:
+    """Yield the leaves of ``layers.mlp``."""
+    yield from linear(f"{where}/linear_1", inward, hidden)
+    yield from linear(f"{where}/linear_2", hidden, outward)
+
+
+def levels(
+    where: str, widths: Sequence[int], count: int, block: Callable[[str, int, int], Iterator[Leaf]]
+) -> Iterator[Leaf]:
+    """Yield the leaves of levels of ``count`` residual blocks; each but the last is resampled.
+
+    ``block(where, inward, outward)`` yields the leaves of a residual block.
+    """
+    inward = widths[0]
+    for level, width in enumerate(widths):
+        for k in range(count):
+            yield from block(f"{where}_{level}/resnet_{k}", inward, width)
+            inward = width
+        if level + 1 < len(widths):
+            yield from convolution(f"{where}_{level}/resample", (3, 3), width, width)
+
+
 def norm(where: str, width: int) -> Iterator[Leaf]:
     """Yield the scale and bias of a norm."""
     yield f"{where}/scale", (width,)
@@ -45,48 +68,36 @@ def draw(
     A ``kernel`` (…, in, out) is normal with variance 1 / (product of all but out), a ``scale`` is
     1, everything else 0.
 
-    Args:
-        shapes: shape of each parameter by path.
-        key: a random key.
-        key_per_leaf: whether each kernel has a key of its own, which follows from its place in the
-            table. Otherwise one array is drawn and cut, which compiles much faster.
+    With ``key_per_leaf`` each kernel has a key of its own, which follows from its place in the
+    table. Otherwise one array is drawn and cut, which compiles much faster.
     """
     kernels = {path: shape for path, shape in shapes.items() if _name(path) == "kernel"}
-    values = (_drawn_apart if key_per_leaf else _drawn_together)(shapes, kernels, key)
-    leaves = {}
-    for path, shape in shapes.items():
-        if path in kernels:
-            leaves[path] = values[path]
-        else:
-            leaves[path] = jnp.ones(shape) if _name(path) == "scale" else jnp.zeros(shape)
-    return tree.unflatten(leaves)
+    if key_per_leaf:
+        values = {
+            path: 1
+            / math.sqrt(math.prod(shape[:-1]))
+            * jax.random.normal(jax.random.fold_in(key, index), shape)
+            for index, (path, shape) in enumerate(shapes.items())
+            if path in kernels
+        }
+    else:
+        ends = list(itertools.accumulate(map(math.prod, kernels.values()), initial=0))
+        drawn = jax.random.normal(key, (ends[-1],))
+        values = {
+            path: jax.lax.slice(drawn, (start,), (end,)).reshape(shape)
+            / math.sqrt(math.prod(shape[:-1]))
+            for (path, shape), (start, end) in zip(
+                kernels.items(), itertools.pairwise(ends), strict=True
+            )
+        }
+    rest = {"scale": jnp.ones}
+    return tree.unflatten(
+        {
+            path: values[path] if path in kernels else rest.get(_name(path), jnp.zeros)(shape)
+            for path, shape in shapes.items()
+        }
+    )
 
 
 def _name(path: str) -> str:
     return path.rsplit("/", 1)[-1]
-
-
-def _drawn_apart(
-    shapes: Mapping[str, tuple[int, ...]], kernels: Mapping[str, tuple[int, ...]], key: Array
-) -> dict[str, Array]:
-    return {
-        path: 1
-        / math.sqrt(math.prod(shape[:-1]))
-        * jax.random.normal(jax.random.fold_in(key, index), shape)
-        for index, (path, shape) in enumerate(shapes.items())
-        if path in kernels
-    }
-
-
-def _drawn_together(
-    shapes: Mapping[str, tuple[int, ...]], kernels: Mapping[str, tuple[int, ...]], key: Array
-) -> dict[str, Array]:
-    del shapes
-    drawn = jax.random.normal(key, (sum(map(math.prod, kernels.values())),))
-    values, at = {}, 0
-    for path, shape in kernels.items():
-        size = math.prod(shape)
-        cut = jax.lax.slice(drawn, (at,), (at + size,))
-        values[path] = cut.reshape(shape) / math.sqrt(math.prod(shape[:-1]))
-        at += size
-    return values

@@ -57,12 +57,7 @@ def _split(name: str | None, size: int) -> tuple[str, ...] | None:
 
 
 def constrain(x: Array, *names: str | None) -> Array:
-    """Constrain an array's sharding by the names of its axes.
-
-    Args:
-        x: any array.
-        names: one per leading axis.
-    """
+    """Constrain an array's sharding by the names of its leading axes."""
     if not _sizes():
         return x
     spec = P(*(_split(name, size) for name, size in zip(names, x.shape, strict=False)))
@@ -70,7 +65,7 @@ def constrain(x: Array, *names: str | None) -> Array:
 
 
 def local(function: Callable[..., Any], takes: Sequence[Names], gives: Names) -> Callable[..., Any]:
-    """Make a function run on each device's part of its arguments.
+    """Make a function of whole arrays run on each device's part of its arguments.
 
     Axes that are not split are gathered first, and every device computes them. The compiler does
     not shard inside the function, so loops over batch or heads stay on the device.
@@ -80,9 +75,6 @@ def local(function: Callable[..., Any], takes: Sequence[Names], gives: Names) ->
         takes: the axis names of each argument. A name is split only if all axes with that name
             can be.
         gives: the axis names of the result, or of every result.
-
-    Returns:
-        The same function, for whole arrays.
     """
 
     def run(*arguments: Any) -> Any:
@@ -114,15 +106,10 @@ def local(function: Callable[..., Any], takes: Sequence[Names], gives: Names) ->
 
 
 def by_batch(function: Callable[..., Any], whole: Any, *batched: Any) -> Any:
-    """Run ``function(whole, *batched)`` on each device's part of a batch.
+    """Run ``function(whole, *batched)`` on each device's part of a batch, the leading axis.
 
-    Args:
-        function: pure; its results have the batch as their leading axis.
-        whole: what every example needs, such as weights; gathered once.
-        batched: trees of arrays with the batch as their leading axis.
-
-    Returns:
-        ``function``'s results, split along the batch.
+    ``whole`` is what every example needs, such as weights; it is gathered once. The results are
+    split along the batch.
     """
     names: list[Names] = [(), *(("batch",) for _ in batched)]
     return local(function, names, ("batch",))(whole, *batched)

@@ -42,10 +42,9 @@ _CURRENT: Any = jax.make_user_context(None)
 
 
 def of_devices(devices: Sequence[Any] | None = None) -> Target:
-    """Return the target of devices, which may be those of a described topology.
+    """Return the target of devices of one kind, by default those of this process.
 
-    Args:
-        devices: all of one kind; None for the default devices of this process.
+    They may be the devices of a described topology.
     """
     first = jax.local_devices()[0] if devices is None else devices[0]
     major, dot, minor = str(getattr(first, "compute_capability", "")).partition(".")

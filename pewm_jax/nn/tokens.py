@@ -28,16 +28,8 @@ from pewm_jax.types import Array
 def patchify(latents_BthwC: Array, patch: int, patch_t: int = 1) -> Array:
     """(B, t, h, w, C) → (B, t/p_t·h/p·w/p, C·p_t·p·p), channels before the patch's cells."""
     batch, frames, height, width, channels = latents_BthwC.shape
-    grid = latents_BthwC.reshape(
-        batch,
-        frames // patch_t,
-        patch_t,
-        height // patch,
-        patch,
-        width // patch,
-        patch,
-        channels,
-    )
+    t, h, w = frames // patch_t, height // patch, width // patch
+    grid = latents_BthwC.reshape(batch, t, patch_t, h, patch, w, patch, channels)
     cells = channels * patch_t * patch * patch
     return grid.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(batch, -1, cells)
 
@@ -47,16 +39,8 @@ def unpatchify(
 ) -> Array:
     """Invert ``patchify`` to (B, frames, height, width, C); sizes are the latents'."""
     batch = tokens_BNC.shape[0]
-    grid = tokens_BNC.reshape(
-        batch,
-        frames // patch_t,
-        height // patch,
-        width // patch,
-        -1,
-        patch_t,
-        patch,
-        patch,
-    )
+    t, h, w = frames // patch_t, height // patch, width // patch
+    grid = tokens_BNC.reshape(batch, t, h, w, -1, patch_t, patch, patch)
     return grid.transpose(0, 1, 5, 2, 6, 3, 7, 4).reshape(batch, frames, height, width, -1)
 
 
@@ -172,26 +156,14 @@ class TokenLayout:
     @property
     def is_text(self) -> np.ndarray:
         """Return (N', 1) bool: True for text tokens."""
-        part = (
-            np.arange(self.text_per_part + self.frames * self.patches_per_part) < self.text_per_part
-        )
-        return np.tile(part, self.parts)[:, None]
+        count = self.text_per_part + self.frames * self.patches_per_part
+        return np.tile(np.arange(count) < self.text_per_part, self.parts)[:, None]
 
     @property
     def real(self) -> np.ndarray | None:
         """Return the indices of the tokens that are not padding; None if there is no padding."""
-        ones = np.ones((1, self.text + self.frames * self.patches, 1), np.int8)
-        marks = _on_host(self, ones)[0, :, 0]
+        part = np.arange(self.parts)[:, None]
+        text = part * self.text_per_part + np.arange(self.text_per_part) < self.text
+        video = part * self.patches_per_part + np.arange(self.patches_per_part) < self.patches
+        marks = np.concatenate([text, np.tile(video, self.frames)], 1).reshape(-1)
         return None if marks.all() else np.flatnonzero(marks)
-
-
-def _on_host(layout: TokenLayout, tokens: np.ndarray) -> np.ndarray:
-    """Compute ``arrange`` with NumPy."""
-    text, video = np.split(tokens, [layout.text], 1)
-    more = layout.parts * layout.text_per_part - layout.text
-    text = np.pad(text, ((0, 0), (0, more), (0, 0))).reshape(1, layout.parts, -1, 1)
-    video = video.reshape(1, layout.frames, layout.patches, 1)
-    more = layout.parts * layout.patches_per_part - layout.patches
-    video = np.pad(video, ((0, 0), (0, 0), (0, more), (0, 0)))
-    video = video.reshape(1, layout.frames, layout.parts, layout.patches_per_part, 1).swapaxes(1, 2)
-    return np.concatenate([text, video.reshape(1, layout.parts, -1, 1)], 2).reshape(1, -1, 1)

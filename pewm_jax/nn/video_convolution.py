@@ -14,13 +14,15 @@ t+2 of the padded video. There are three equivalent forms:
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
+from pewm_jax.errors import UserError
 from pewm_jax.nn import target
 from pewm_jax.types import Array, Params
 
@@ -29,24 +31,16 @@ POINTS = (0.0, 1.0, -1.0, 0.5, -2.0)
 separated numbers keep rounding errors small."""
 WORTHWHILE = 256
 """Fewest output pixels of all frames for which ``winograd`` is faster."""
-SAME = ((1, 1), (1, 1))
-"""Padding by one row or column of zeros on every side."""
+SAME, AFTER = ((1, 1), (1, 1)), ((0, 1), (0, 1))
+"""Padding by one row or column of zeros on every side, and below and to the right alone."""
+Form = Literal["auto", "taps", "volume", "winograd"]
 
 
-class Settings(Protocol):
-    """The settings of an autoencoder with 3D convolutions."""
-
-    @property
-    def convolution(self) -> str:
-        """``auto``, ``taps``, ``volume`` or ``winograd``."""
-        ...
-
-
-def convolve(config: Settings, params: Params, padded_BTHWC: Array) -> Array:
+def convolve(how: Form, params: Params, padded_BTHWC: Array) -> Array:
     """3×3×3 convolution of a video already padded in time; zeros around the frame.
 
     Args:
-        config: ``config.convolution`` chooses the form.
+        how: the form.
         params: ``kernel`` (3, 3, 3, C, D) and ``bias``.
         padded_BTHWC: (B, T + 2, H, W, C); its dtype is that of the computation.
 
@@ -55,7 +49,7 @@ def convolve(config: Settings, params: Params, padded_BTHWC: Array) -> Array:
     """
     dtype = padded_BTHWC.dtype
     _, frames, height, width, _ = padded_BTHWC.shape
-    kernel, how = params["kernel"], form(config, dtype)
+    kernel, how = params["kernel"], form(how, dtype)
     if how == "volume":
         out = jax.lax.conv_general_dilated(
             padded_BTHWC,
@@ -71,6 +65,61 @@ def convolve(config: Settings, params: Params, padded_BTHWC: Array) -> Array:
     return (out + params["bias"]).astype(dtype)
 
 
+def convolve_causal(
+    how: Form, params: Params, x_BTHWC: Array, past_BTHWC: Array
+) -> tuple[Array, Array]:
+    """3×3×3 convolution over each frame and the two before; zeros around the frame.
+
+    ``past_BTHWC`` are the two frames before. Returns the result and the next chunk's past.
+    """
+    padded = jnp.concatenate([past_BTHWC, x_BTHWC], 1)
+    return convolve(how, params, padded), padded[:, -2:]
+
+
+def in_chunks(
+    step: Callable[[Array, Params], tuple[Array, Params]], x_BTHWC: Array, first: int, size: int
+) -> Array:
+    """Run ``step(chunk, past) → (out, past)`` on the first frames, then on ``size`` at a time.
+
+    The outputs are joined along time. The first chunk's past is {}. Chunks of equal shape share one
+    compiled body: inside ``jit`` they are scanned, outside ``step`` is called for each.
+    """
+    batch, frames, *rest = x_BTHWC.shape
+    out, past = step(x_BTHWC[:, :first], {})
+    if frames == first:
+        return out
+    if not isinstance(x_BTHWC, Tracer):
+        outs = [out]
+        for start in range(first, frames, size):
+            out, past = step(x_BTHWC[:, start : start + size], past)
+            outs.append(out)
+        return jnp.concatenate(outs, 1)
+
+    def body(past: Params, chunk: Array) -> tuple[Params, Array]:
+        out, past = step(chunk, past)
+        return past, out
+
+    chunks = x_BTHWC[:, first:].reshape(batch, -1, size, *rest)
+    _, outs = jax.lax.scan(body, past, jnp.moveaxis(chunks, 1, 0))
+    outs = jnp.moveaxis(outs, 0, 1).reshape(batch, -1, *out.shape[2:])
+    return jnp.concatenate([out, outs], 1)
+
+
+def require_video(x: Array, channels: int, name: str) -> None:
+    """Refuse arrays that are not a batch of videos of floats with this number of channels.
+
+    Raises:
+        UserError: another shape or dtype.
+    """
+    if x.ndim != 5 or x.shape[-1] != channels:
+        raise UserError(
+            f"{name} has shape {tuple(x.shape)}: five axes are needed, batch, time, height, width "
+            f"and {channels} channels last."
+        )
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        raise UserError(f"{name} holds {x.dtype}: convert it to floats first.")
+
+
 def convolve_frames(params: Params, x_BTHWC: Array, stride: int, padding: Sequence) -> Array:
     """2D convolution of every frame, ``kernel`` (3, 3, C, D) and ``bias``."""
     out = _frames(x_BTHWC, params["kernel"].astype(x_BTHWC.dtype), stride, padding)
@@ -78,17 +127,11 @@ def convolve_frames(params: Params, x_BTHWC: Array, stride: int, padding: Sequen
 
 
 def convolve_upsampled(params: Params, x_BTHWC: Array) -> Array:
-    """Upsample frames twofold (nearest) and convolve them, without storing the upsampled.
+    """Upsample frames twofold (nearest) and convolve them by ``kernel`` (3, 3, C, D) and ``bias``.
 
     A 3×3 window of an upsampled frame covers 2×2 different pixels. Each of the four output pixels
-    of an input pixel is therefore a 2×2 convolution of the input: 16 products instead of 36.
-
-    Args:
-        params: ``kernel`` (3, 3, C, D) and ``bias``.
-        x_BTHWC: (B, T, H, W, C).
-
-    Returns:
-        (B, T, 2H, 2W, D).
+    of an input pixel is therefore a 2×2 convolution of the input: 16 products instead of 36, and
+    the upsampled frames are not stored.
     """
     dtype, kernel = x_BTHWC.dtype, params["kernel"].astype(jnp.float32)  # for exact sums
     batch, frames, height, width, _ = x_BTHWC.shape
@@ -108,13 +151,10 @@ def convolve_upsampled(params: Params, x_BTHWC: Array) -> Array:
     return (out + params["bias"]).astype(dtype)
 
 
-def form(config: Settings, dtype: jnp.dtype) -> str:
-    """Return the form of the 3D convolutions: ``taps``, ``winograd`` or ``volume``.
-
-    ``auto`` depends on the target of the trace.
-    """
-    if config.convolution != "auto":
-        return config.convolution
+def form(how: Form, dtype: jnp.dtype) -> Form:
+    """Return the form of the 3D convolutions; ``auto`` depends on the target of the trace."""
+    if how != "auto":
+        return how
     if target.current().platform != "cpu":
         return "volume"
     return "winograd" if dtype == jnp.float32 else "taps"

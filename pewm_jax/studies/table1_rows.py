@@ -24,7 +24,7 @@ from pewm_jax.memory.points import PointsConfig
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.memory.voxel_map import Map2DConfig, VoxelConfig
 from pewm_jax.models.dinov2 import model as dinov2
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.render import RenderConfig
 from pewm_jax.worlds import world_model

@@ -36,9 +36,9 @@ from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.worlds.pewm.world import PEWM
 from tests.properties import examples

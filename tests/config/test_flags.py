@@ -14,8 +14,8 @@ from pewm_jax.config import Config, ConfigError
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig
 from pewm_jax.memory.images import ImagesConfig
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.cogvideox.vae import VAECodec
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 
 TINY = presets.load("tiny")
 VERSION_1 = Path(__file__).parent / "version_1"

@@ -22,7 +22,7 @@ import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import presets, registry
 from pewm_jax.cli import main as program
-from pewm_jax.convert import cogvideox, cogvideox_world, pipeline, schedulers, widen
+from pewm_jax.convert import cogvideox, pipeline, schedulers, widen
 from pewm_jax.io import sources, tensor_files, weights
 from pewm_jax.io.published import LINEAR, Entry
 from pewm_jax.models.cogvideox import model as dit
@@ -210,7 +210,7 @@ def test_a_fresh_world_model_gives_the_colours_of_the_original(variant, kind):
         network.entries(old), sources.in_memory(source, variant), network.like(old), "float32"
     )
     vae = cogvideox.VAE.config(dict(pipelines.vae().config), "vae")
-    config = cogvideox_world.config_of(
+    config = cogvideox.config_of(
         old, vae, schedulers.cogvideox_from_diffusers(
             {"_class_name": "CogVideoXDDIMScheduler", **pipelines.SCHEDULER}
         ), (9, 32, 32), "float32",
@@ -297,7 +297,7 @@ def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, bill
     preset = presets.load(f"pewm_{variant}")
     noise = preset.model.noise
     backbone, codec = DiTBackbone.published(variant), preset.model.codec
-    made = cogvideox_world.config_of(backbone, codec, noise, (None, None, None), "bfloat16")
+    made = cogvideox.config_of(backbone, codec, noise, (None, None, None), "bfloat16")
     assert without(made.train, "run") == without(preset.train, "run")
     assert (made.data, made.evaluate) == (preset.data, preset.evaluate)
     assert without(made.model, "memory", "backbone") == without(preset.model, "memory", "backbone")
@@ -305,9 +305,7 @@ def test_an_imported_checkpoint_starts_from_the_preset_of_its_size(variant, bill
     assert without(made.model.memory, "encoder") == without(preset.model.memory, "encoder")
     assert registry.of(made.model.memory.encoder).name == "patch_colours"
     encoder = preset.model.memory.encoder
-    made = cogvideox_world.config_of(
-        backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder
-    )
+    made = cogvideox.config_of(backbone, codec, noise, (None,) * 3, "bfloat16", encoder=encoder)
     assert made.model.memory == preset.model.memory
     blocks = jax.eval_shape(lambda: made.model.memory.reader.init(made.model, jax.random.key(0)))
     count = sum(leaf.size for leaf in jax.tree.leaves(blocks))

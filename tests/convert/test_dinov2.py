@@ -12,6 +12,7 @@ from pewm_jax.config import UserError
 from pewm_jax.convert import dinov2, pipeline
 from pewm_jax.models.dinov2 import model
 from pewm_jax.models.dinov2.config import DINOv2Config
+from pewm_jax.models.dinov2.convert import entries
 
 CONFIG = DINOv2Config(layers=2, heads=1, width=64, pretrained_size=28, registers=2, antialias=True)
 SETTINGS = {
@@ -35,7 +36,7 @@ def params():
 @pytest.fixture
 def folder(params, tmp_path):
     """A transformers folder, its tensors written by our own table."""
-    return write(tmp_path / "theirs", dict(pipeline.write_tensors(dinov2.entries(CONFIG), params)))
+    return write(tmp_path / "theirs", dict(pipeline.write_tensors(entries(CONFIG), params)))
 
 
 def write(folder, tensors, settings=SETTINGS):
@@ -52,7 +53,7 @@ def test_entries_read_what_they_wrote(folder, params):
 
 
 def test_shards_are_read_like_one_file(folder, params):
-    tensors = dict(pipeline.write_tensors(dinov2.entries(CONFIG), params))
+    tensors = dict(pipeline.write_tensors(entries(CONFIG), params))
     (folder / "model.safetensors").unlink()
     table = {}
     for number, name in enumerate(tensors):
@@ -96,7 +97,7 @@ def test_settings_that_do_not_fit_are_refused(folder, change, words):
 
 
 def test_tensors_that_do_not_fit_are_refused(folder, params, tmp_path):
-    tensors = dict(pipeline.write_tensors(dinov2.entries(CONFIG), params))
+    tensors = dict(pipeline.write_tensors(entries(CONFIG), params))
     del tensors["layernorm.bias"]
     with pytest.raises(UserError, match=r"lacks 1 tensors \(layernorm.bias\)"):
         dinov2.read(write(folder, tensors))
@@ -125,22 +126,28 @@ def test_torch_files_are_read_as_tables_of_tensors_and_nothing_else(tmp_path):
     torch = pytest.importorskip("torch")
     path = tmp_path / "weights.pth"
     path.write_bytes(b"not a torch file")
-    with pytest.raises(UserError, match="cannot be read as a state dict"):
+    with pytest.raises(UserError, match="cannot be read as a table of tensors"):
         dinov2.read(path)
     torch.save({"epoch": 3, "model": {"cls_token": torch.zeros(1)}}, path)
-    with pytest.raises(UserError, match="not a plain table of names and tensors"):
+    with pytest.raises(UserError, match="cannot be read as a table of tensors"):
         dinov2.read(path)
     torch.save({"cls_token": Danger()}, path)
-    with pytest.raises(UserError, match="cannot be read as a state dict"):
+    with pytest.raises(UserError, match="cannot be read as a table of tensors"):
         dinov2.read(path)
     assert not Danger.done
 
 
-def test_without_torch_a_torch_file_is_refused_with_the_extra_s_name(tmp_path, monkeypatch):
-    (tmp_path / "weights.pth").write_bytes(b"")
+def test_a_torch_file_is_read_without_torch(folder, params, tmp_path, monkeypatch):
+    torch = pytest.importorskip("torch")
+    tensors = {
+        name: torch.tensor(np.asarray(tensor))
+        for name, tensor in pipeline.write_tensors(entries(CONFIG), params)
+    }
+    torch.save(tensors, tmp_path / "weights.pth")
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(UserError, match=r"pip install 'pewm-jax\[convert\]'"):
-        dinov2.read(tmp_path / "weights.pth")
+    config, read = dinov2.read(tmp_path / "weights.pth")
+    assert config == CONFIG
+    jax.tree.map(np.testing.assert_array_equal, read, params)
 
 
 def test_nothing_is_overwritten_and_nothing_half_written_stays(folder, tmp_path):

@@ -189,11 +189,11 @@ FAULTS = {
     "no class": (class_of("vae", "config.json", None), "is of class None"),
     "unknown setting": (
         lambda src: edit(src / "transformer/config.json", window=3),
-        "setting window (3) is unknown",
+        "settings that are not known: window",
     ),
     "unsupported value": (
         lambda src: edit(src / "transformer/config.json", norm_eps=1e-6),
-        "norm_eps is 1e-06; only 1e-05 is known",
+        "norm_eps is 1e-06; only 1e-05 is supported",
     ),
     "no tokenizer": (drop_tokenizer, "src/tokenizer does not; copy both or neither"),
     "another text encoder": (narrow_text, "d_model 16 but the transformer takes text of 12"),

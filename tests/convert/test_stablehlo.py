@@ -14,7 +14,8 @@ import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
 from pewm_jax.config import ClipConfig, UserError
-from pewm_jax.convert import stablehlo, stablehlo_programs
+from pewm_jax.convert import stablehlo
+from pewm_jax.convert import stablehlo as stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
 from pewm_jax.memory.voxel_map import VoxelConfig

@@ -15,7 +15,7 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import Config, ConfigError, DataConfig, UserError
-from pewm_jax.convert import stablehlo_programs
+from pewm_jax.convert import stablehlo as stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.encoders.simple import LatentsConfig, PatchColoursConfig
 from pewm_jax.io import tree

@@ -16,7 +16,7 @@ from pewm_jax.memory import feature_cache
 from pewm_jax.memory import feature_cache as feature_build
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from tests.data import two_rooms as data_world
 
 NETWORK = DINOv2Config(layers=1, heads=1, width=8, pretrained_size=28)

@@ -11,7 +11,7 @@ import pytest
 from pewm_jax.config import UserError
 from pewm_jax.models.svd import layers as svd
 from pewm_jax.nn import attention as blocked_attention
-from pewm_jax.nn import splash, target
+from pewm_jax.nn import target
 from pewm_jax.nn.target import Target
 
 H100, A100, T4, V5P = (
@@ -30,13 +30,13 @@ def inputs(batch=2, heads=3, queries=13, keys=11, channels=8):
 def test_pieces_make_the_whole(blocks):
     q, k, v = inputs()
     want = blocked_attention.plain_attention(q, k, v)
-    got = blocked_attention.in_pieces(q, k, v, blocks)
+    got = blocked_attention._pieces_forward(q, k, v, blocks=blocks)[0]
     np.testing.assert_allclose(got, want, rtol=1e-5, atol=1e-6)
 
 
 def test_large_logits_do_not_overflow():
     q, k, v = inputs()
-    got = blocked_attention.in_pieces(q * 1e3, k * 1e3, v, 2)
+    got = blocked_attention._pieces_forward(q * 1e3, k * 1e3, v, blocks=2)[0]
     np.testing.assert_allclose(
         got, blocked_attention.plain_attention(q * 1e3, k * 1e3, v), rtol=1e-3, atol=1e-3
     )
@@ -266,7 +266,7 @@ def test_splash_attention_equals_the_reference_forward_and_backward(queries, key
 
         return jax.jit(jax.value_and_grad(function, (0, 1, 2), has_aux=True))(q, k, v)
 
-    (_, got), slopes = total(functools.partial(splash.splash, interpret=True))
+    (_, got), slopes = total(functools.partial(blocked_attention.splash, interpret=True))
     (_, want), exact = total(reference)
     assert got.dtype == dtype
     most = 1e-5 if dtype == jnp.float32 else 2e-3
@@ -280,5 +280,5 @@ def test_splash_attention_equals_the_reference_forward_and_backward(queries, key
 
 def test_tiles_waste_little():
     for tokens in (*range(1, 700), 3298, 17776):
-        padded = -(-tokens // splash.tile(tokens)) * splash.tile(tokens)
+        padded = -(-tokens // blocked_attention.tile(tokens)) * blocked_attention.tile(tokens)
         assert padded - tokens < 256 or padded <= 1.2 * tokens

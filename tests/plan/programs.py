@@ -13,9 +13,9 @@ from pewm_jax.config import ClipConfig, Config, DataConfig, MeshConfig, StageCon
 from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.plan import measure, suggest
 from pewm_jax.plan.measure import MeshSizes
 from pewm_jax.plan.program import COLLECTIVES

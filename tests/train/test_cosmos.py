@@ -24,7 +24,7 @@ from pewm_jax.data import abstract
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
-from pewm_jax.models.wan.codec import WanVAECodec
+from pewm_jax.models.wan.vae import WanVAECodec
 from pewm_jax.plan import program
 from pewm_jax.plan.measure import QUICK
 from pewm_jax.train import flops, sharding

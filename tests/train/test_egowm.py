@@ -23,10 +23,10 @@ from pewm_jax.data import abstract
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree
-from pewm_jax.models.clip.config import CLIPVisionConfig
+from pewm_jax.models.clip.model import CLIPVisionConfig
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
-from pewm_jax.models.svd.vae_codec import SVDVAECodec
+from pewm_jax.models.svd.unet import SVDUNetBackbone
+from pewm_jax.models.svd.vae import SVDVAECodec
 from pewm_jax.plan import program
 from pewm_jax.plan.measure import QUICK
 from pewm_jax.train import flops, sharding, step

@@ -13,9 +13,9 @@ from pewm_jax import presets as configs
 from pewm_jax.config import AXES, ConfigError, MeshConfig
 from pewm_jax.io import tree, weights
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.train import sharding
 from pewm_jax.train import step as state
 from pewm_jax.worlds.pewm.world import STAGES

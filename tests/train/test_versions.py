@@ -25,9 +25,9 @@ from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.points import PointsConfig
 from pewm_jax.memory.voxel_map import Map2DConfig, VoxelConfig
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.train import checkpoint_files, loop, runs, sharding, step
 from pewm_jax.train.checkpoint import CONFIG_ITEM, Checkpoints

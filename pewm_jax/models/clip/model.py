@@ -5,15 +5,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.errors import UserError
-from pewm_jax.models.clip.config import CLIPVisionConfig
+from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models.dinov2.model import resize_matrix
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import layer_norm, linear
@@ -26,6 +26,50 @@ MEAN_3 = (0.48145466, 0.4578275, 0.40821073)
 """Mean colour in [0, 1] of CLIP's training images, which it subtracts."""
 STD_3 = (0.26862954, 0.26130258, 0.27577711)
 """Standard deviation of colours, by which CLIP divides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CLIPVisionConfig:
+    """A vision transformer in CLIP's form with its projection (arXiv 2103.00020): ViT-H/14."""
+
+    layers: int = 32
+    """Transformer blocks."""
+    heads: int = 16
+    """Attention heads."""
+    width: int = 1280
+    """Model width."""
+    hidden: int = 5120
+    """Width of the feed-forward's hidden layer."""
+    projection: int = 1024
+    """Channels of the embedding of an image."""
+    image_size: int = 224
+    """Side of an image in pixels; no other size is accepted."""
+    patch: int = 14
+    """Pixels per patch, along height and along width."""
+    activation: Literal["gelu", "quick_gelu"] = "gelu"
+    """`quick_gelu` is x·sigmoid(1.702 x), as in OpenAI's models."""
+    epsilon: float = 1e-5
+    """Added to the variance in layer norms."""
+
+    @property
+    def tokens(self) -> int:
+        """Tokens of an image: its patches and one for the whole."""
+        return 1 + (self.image_size // self.patch) ** 2
+
+    def __post_init__(self):
+        """Validate."""
+        sizes = ("layers", "heads", "width", "hidden", "projection", "image_size", "patch")
+        require_positive(self, "clip_vision", *sizes)
+        require(
+            self.width % self.heads == 0,
+            f"clip_vision.width {self.width} is not a multiple of clip_vision.heads {self.heads}.",
+        )
+        require(
+            self.image_size % self.patch == 0,
+            f"clip_vision.image_size {self.image_size} is not a multiple of clip_vision.patch "
+            f"{self.patch}.",
+        )
+        require(self.epsilon > 0, f"clip_vision.epsilon is {self.epsilon}: it must be positive.")
 
 
 def init(config: CLIPVisionConfig, key: Array) -> Params:
@@ -48,17 +92,10 @@ def init(config: CLIPVisionConfig, key: Array) -> Params:
 
 
 def apply(config: CLIPVisionConfig, params: Params, images_BHWC: Array) -> Array:
-    """Return the projected embedding of every image.
+    """Return the projected embedding of every image, (B, projection), not of unit length.
 
-    Args:
-        config: the encoder.
-        params: its parameters.
-        images_BHWC: (B, image_size, image_size, 3) floats, already normalised (see
-            ``preprocess``). Their dtype is the dtype of the computation; norms and softmax are in
-            float32.
-
-    Returns:
-        (B, projection) in the images' dtype, not normalised to unit length.
+    The images are floats from ``preprocess``. Their dtype is the dtype of the computation; norms
+    and softmax are in float32.
 
     Raises:
         UserError: images of another shape or dtype.
@@ -87,14 +124,7 @@ def preprocess(rgb_BHWC: Array, size: int = 224) -> Array:
 
     Resizing is that of the pipeline of Stable Video Diffusion in diffusers: a Gaussian blur whose
     width follows from the factor, then bicubic interpolation with aligned corners. Along each axis
-    both are one matrix.
-
-    Args:
-        rgb_BHWC: (B, H, W, 3) floats in [−1, 1], at least 2 × 2 pixels.
-        size: the new side in pixels.
-
-    Returns:
-        (B, size, size, 3) in the dtype of the colours.
+    both are one matrix. The dtype is that of the colours.
 
     Raises:
         UserError: no RGB images, or too small ones.

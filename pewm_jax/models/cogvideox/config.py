@@ -145,10 +145,7 @@ class DiTConfig:
 
     @classmethod
     def published(cls, name: str) -> Self:
-        """Return the configuration of a published CogVideoX network.
-
-        Args:
-            name: one of ``PUBLISHED``.
+        """Return the configuration of a published CogVideoX network, one of ``PUBLISHED``.
 
         Raises:
             ConfigError: there is no such network.
@@ -297,27 +294,14 @@ class VAEConfig:
 
     @classmethod
     def published(cls, variant: str) -> Self:
-        """Return the autoencoder of a published CogVideoX.
-
-        Args:
-            variant: ``2b``, ``5b``, ``5b-I2V``, ``1.5-5B`` or ``1.5-5B-I2V``.
+        """Return the autoencoder of a published CogVideoX, one of ``PUBLISHED``.
 
         Raises:
             ConfigError: another name.
         """
-        if variant not in _SCALES:
+        if variant not in PUBLISHED:
             raise ConfigError(
-                f"no CogVideoX is called {variant!r}; choose one of {', '.join(_SCALES)}."
+                f"no CogVideoX is called {variant!r}; choose one of {', '.join(PUBLISHED)}."
             )
-        scale, inverted = _SCALES[variant]
-        return cls(scaling_factor=scale, invert_scale_latents=inverted)
-
-
-_SCALES = {
-    "2b": (1.15258426, False),
-    "5b": (0.7, False),
-    "5b-I2V": (0.7, False),
-    "1.5-5B": (0.7, False),
-    "1.5-5B-I2V": (0.7, True),
-}
-"""Variant → scaling factor, and whether images are divided by it."""
+        scale = 1.15258426 if variant == "2b" else 0.7
+        return cls(scaling_factor=scale, invert_scale_latents=variant == "1.5-5B-I2V")

@@ -58,13 +58,9 @@ class LayerNormZero(nn.Module):
     def __call__(
         self, tokens_BND: Array, time_BE: Array, layout: TokenLayout
     ) -> tuple[Array, Array]:
-        """Return normalised and modulated tokens, and the gate (B, N, D) of each token.
+        """Return normalised and modulated text and video tokens, and the gate (B, N, D) of each.
 
-        Args:
-            tokens_BND: (B, L + N, D) text and video tokens.
-            time_BE: (B, E) time embedding; or (B, 1 + t, E): the text's, then one for each token
-                in time.
-            layout: the order of the tokens.
+        ``time_BE`` is (B, E); or (B, 1 + t, E): the text's, then one for each token in time.
         """
         width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
         linear = nn.Dense(
@@ -97,14 +93,7 @@ class Block(nn.Module):
     def __call__(
         self, tokens_BND: Array, time_BE: Array, angles_NR: Array | None, layout: TokenLayout
     ) -> Array:
-        """Return the updated tokens.
-
-        Args:
-            tokens_BND: (B, L + N, D) text and video tokens.
-            time_BE: (B, E) time embedding.
-            angles_NR: (L + N, head_dim/2) rotary angles in the order of the tokens, or None.
-            layout: the order of the tokens.
-        """
+        """Return the updated tokens; angles (L + N, head_dim/2) are in the order of the tokens."""
         before: Any = nn.remat(Block.before, policy=KEEP, prevent_cse=False, static_argnums=(4,))
         after: Any = nn.remat(Block.after, policy=KEEP, prevent_cse=False, static_argnums=(5,))
         q, k, v, gate = before(self, tokens_BND, time_BE, angles_NR, layout)
@@ -238,13 +227,10 @@ def apply(
     modulation_BtE: Array | None = None,
     added_BND: Array | None = None,
 ) -> Array:
-    """Predict from noisy latents.
+    """Predict from noisy latents: (B, t, h, w, C_out) in their dtype, that of the computation.
 
     Args:
-        config: the transformer.
-        params: its parameters.
-        latents_BthwC: (B, t, h, w, C) input latents; h and w are multiples of the patch, t of
-            ``patch_t``. Their dtype is the dtype of the computation.
+        latents_BthwC: h and w are multiples of the patch, t of ``patch_t``.
         text_BLD: (B, L, text_dim) text tokens.
         timesteps_B: (B,) diffusion times, 0 … train_steps − 1, or a single one; or (B, t'), one
             for each of the t' = t / ``patch_t`` tokens in time (the text gets their mean).
@@ -255,9 +241,6 @@ def apply(
         modulation_BtE: (B, t', E) added to the time embedding of each token in time, not to the
             text's.
         added_BND: (B, N, D) added to the embedded video tokens, in the order of ``layout_of``.
-
-    Returns:
-        (B, t, h, w, C_out) prediction in the latents' dtype; C_out is the output layer's.
 
     Raises:
         UserError: the network cannot take these sizes; raised while tracing.

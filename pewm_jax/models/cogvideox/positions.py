@@ -22,11 +22,7 @@ Grid = tuple[int, int, int]
 
 
 def token_grid(config: DiTConfig, shape: tuple[int, ...]) -> Grid:
-    """Return the token grid of latents, or refuse sizes that the network cannot take.
-
-    Args:
-        config: the transformer.
-        shape: (B, t, h, w, C) of the latents.
+    """Return the token grid of latents (B, t, h, w, C).
 
     Raises:
         UserError: the network cannot take latents of this size.
@@ -90,11 +86,7 @@ def sample_tokens(config: DiTConfig) -> int:
 def add(config: DiTConfig, tokens_BND: Array, table_ND: Array | None, grid: Grid) -> Array:
     """Add the positions that are not rotary to text and video tokens: a table or a sinusoid.
 
-    Args:
-        config: the transformer.
-        tokens_BND: (B, L + t·h·w, D) text tokens, then video tokens.
-        table_ND: (L + N, D) the learned table of the sample size, if there is one.
-        grid: t, h, w.
+    ``table_ND`` is the learned table of the sample size, if there is one.
     """
     length, dtype = tokens_BND.shape[1] - math.prod(grid), tokens_BND.dtype
     if config.positions == "rope_learned" and config.learned != "drop":
@@ -129,9 +121,7 @@ def resized(config: DiTConfig, table_ND: Array, grid: Grid) -> Array:
 def crop_region(grid: tuple[int, int], base: tuple[int, int]) -> tuple[tuple[int, int], ...]:
     """Return (top, left), (bottom, right): the grid fitted into the middle of the base grid.
 
-    Args:
-        grid: (rows, columns) of tokens.
-        base: (rows, columns) of the grid that the network was trained for.
+    Both are rows and columns of tokens; the network was trained for the base grid.
     """
     rows, columns = grid
     base_rows, base_columns = base
@@ -160,15 +150,9 @@ def rope_places(config: DiTConfig, grid: Grid) -> tuple[np.ndarray, np.ndarray, 
 def rope_angles(
     frames: np.ndarray, rows: np.ndarray, columns: np.ndarray, head_dim: int
 ) -> np.ndarray:
-    """Return (t·h·w, head_dim/2) rotary angles, theta 1e4.
+    """Return (t·h·w, head_dim/2) rotary angles of the positions along time, height and width.
 
-    A head is split 1/4 time, 3/8 height, 3/8 width.
-
-    Args:
-        frames: (t,) positions in time.
-        rows: (h,) positions down the picture.
-        columns: (w,) positions across the picture.
-        head_dim: channels of a head.
+    Theta is 1e4; a head is split 1/4 time, 3/8 height, 3/8 width.
     """
     parts = (head_dim // 4, head_dim // 8 * 3, head_dim // 8 * 3)
     grid = np.meshgrid(frames, rows, columns, indexing="ij")

@@ -4,25 +4,20 @@ Four frames of 8 × 8 pixels become one latent; the first frame has a latent of 
 encoded in chunks of 8 frames (the first chunk also takes the remainder) and decoded in chunks of 2
 latents (3 in the first chunk if their number is odd). Every convolution passes its last two frames
 on to the next chunk, but the group norms see one chunk at a time. The chunks therefore affect the
-result, and they bound the memory. A latent depends on later frames only through the statistics of
-the norms, which cover its own chunk.
-
-Chunks of equal shape share one compiled body. Inside ``jit`` they are scanned. Outside, ``encode``
-and ``decode`` call a compiled function per chunk, so two compilations serve videos of any length.
+result, and they bound the memory. Outside of ``jit``, a compiled function is called per chunk, so
+two compilations serve videos of any length.
 
 8N + 1 frames become 2N + 1 latents and 8N + 1 frames again. An *even* number of latents has no
-first-frame rule: 2 latents decode to 8 frames, not 5. See ``frames_of`` and ``latents_of``.
+first-frame rule: 2 latents decode to 8 frames, not 5. Large frames may be processed in overlapping
+spatial tiles, which are blended (``in_tiles``), with less memory and a slightly different result.
 
-Large frames may be processed in overlapping spatial tiles, which are blended (``in_tiles``). Tiles
-need less memory than whole frames. The result differs slightly, since norms and borders see only a
-tile. Tiles of equal shape share one compiled body and run one after another.
-
-Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``. Reference:
-``AutoencoderKLCogVideoX`` of diffusers.
+Neither ``encode`` nor ``decode`` applies ``config.scaling_factor``; ``VAECodec`` does, a codec of
+the mean of the latents. Reference: ``AutoencoderKLCogVideoX`` of diffusers.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Callable
 from functools import partial
@@ -31,13 +26,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from pewm_jax.errors import UserError
+from pewm_jax.errors import UserError, require
 from pewm_jax.models.cogvideox import vae_layers as layers
 from pewm_jax.models.cogvideox.config import VAEConfig
 from pewm_jax.models.cogvideox.vae_layers import layout
+from pewm_jax.models.interface import PublishedVAE
 from pewm_jax.nn.parameters import draw
+from pewm_jax.nn.video_convolution import in_chunks, require_video
 from pewm_jax.types import Array, Params
 
 ENCODE_FRAMES = 8
@@ -50,24 +46,47 @@ LOGVAR_RANGE = (-30.0, 20.0)
 _log = logging.getLogger(__name__)
 
 
+@dataclasses.dataclass(frozen=True)
+class VAECodec(VAEConfig, PublishedVAE):
+    """The video autoencoder of CogVideoX; its weights come from a converted checkpoint."""
+
+    def check(self, model: Any) -> None:
+        """Refuse clips that cannot be encoded, or decode to another number of frames."""
+        super().check(model)
+        require(
+            self.frames(model.clip.frames) % 2 == 1,
+            f"clip.frames {model.clip.frames}: the VAE decodes an even number of latent frames "
+            "without its first-frame rule (2 latent frames become 8 frames, not 5); use 8k + 1 "
+            "frames (9, 17, 25, …).",
+        )
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters."""
+        return init(self, key)
+
+    def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
+        """Encode a video to the scaled mean of its latents; see ``Codec.encode``."""
+        inverse = condition and self.invert_scale_latents
+        mean, _ = encode(self, params, video_BTHWC)
+        return mean * (1 / self.scaling_factor if inverse else self.scaling_factor)
+
+    def decode(self, params: Params, latents_BthwC: Array) -> Array:
+        """Decode scaled latents to q·(t − 1) + 1 frames.
+
+        Raises:
+            UserError: the VAE decodes this many latents to another number of frames.
+        """
+        frames = self.temporal * (latents_BthwC.shape[1] - 1) + 1
+        return decode(self, params, latents_BthwC / self.scaling_factor, frames=frames)
+
+
 def init(config: VAEConfig, key: Array) -> Params:
-    """Return random parameters: float32, kernels of variance 1/inputs, scales 1, biases 0.
-
-    Args:
-        config: the autoencoder.
-        key: a random key.
-
-    Returns:
-        ``{"encoder": …, "decoder": …}``.
-    """
+    """Return random parameters, float32: ``{"encoder": …, "decoder": …}``."""
     return draw(layout(config), key, key_per_leaf=True)
 
 
 def frames_of(config: VAEConfig, latents: int) -> int:
-    """Return the number of frames that some latents decode to.
-
-    Odd: temporal·(latents − 1) + 1. Even: temporal·latents, without the first-frame rule.
-    """
+    """Return the number of frames that latents decode to; an even number has no first frame."""
     return config.temporal * (latents - 1) + 1 if latents % 2 else config.temporal * latents
 
 
@@ -88,24 +107,18 @@ def latents_of(config: VAEConfig, frames: int) -> int:
 
 
 def encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
-    """Encode a video to the mean and variance of its latents.
+    """Encode a video to mean and logarithm of the variance of its latents, (B, t, H/8, W/8, z).
 
-    To sample, compute mean + exp(logvar / 2)·noise.
-
-    Args:
-        config: the autoencoder.
-        params: its parameters.
-        video_BTHWC: (B, T, H, W, C) floats in [−1, 1]; their dtype is that of the computation.
-            T is 8N + 1, or another number that ``latents_of`` accepts. H and W are multiples
-            of ``config.spatial``; excess rows and columns are lost, as in the reference.
-
-    Returns:
-        Mean and logarithm of the variance, each (B, t, H/8, W/8, z), not scaled.
+    They are not scaled. To sample, compute mean + exp(logvar / 2)·noise. The video is of floats in
+    [−1, 1], whose dtype is that of the computation; T is 8N + 1, or another number that
+    ``latents_of`` accepts. Rows and columns beyond a multiple of ``config.spatial`` are lost, as in
+    the reference.
 
     Raises:
         UserError: frames that cannot be encoded.
     """
-    _, frames, height, width, _ = _shape(video_BTHWC, config.in_channels, "video_BTHWC")
+    require_video(video_BTHWC, config.in_channels, "video_BTHWC")
+    frames, height, width = video_BTHWC.shape[1:4]
     latents = latents_of(config, frames)
     side = config.spatial
     if min(height, width) < side:
@@ -124,47 +137,7 @@ def encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array
             "use 8N + 1 frames (1, 9, 17, …, 49).",
             *(frames, latents, frames_of(config, latents)),
         )
-    return _encode(config, params, video_BTHWC)
 
-
-def decode(
-    config: VAEConfig, params: Params, latents_BthwC: Array, *, frames: int | None = None
-) -> Array:
-    """Decode latents to a video.
-
-    Memory does not grow with the length of the clip, since two latents are decoded at a time. With
-    the published widths, 49 frames of 480 × 720 in float32 need 20.8 GiB besides parameters and
-    video, by XLA's memory analysis on a CPU (``python benchmarks/cogvideox_vae.py --memory``). It
-    is proportional to the pixels of a frame: with ``config.tiling``, tiles of 240 × 360 need about
-    a quarter.
-
-    Args:
-        config: the autoencoder.
-        params: its parameters.
-        latents_BthwC: (B, t, h, w, z) latents, divided by ``config.scaling_factor`` again; their
-            dtype is that of the computation.
-        frames: the number of frames expected; if not given, an even number of latents warns.
-
-    Returns:
-        (B, T, 8h, 8w, C) video in about [−1, 1]; T = ``frames_of(config, t)``.
-
-    Raises:
-        UserError: the latents decode to another number of frames than expected.
-    """
-    _, count, *_ = _shape(latents_BthwC, config.latent_channels, "latents_BthwC")
-    out = frames_of(config, count)
-    advice = (
-        f"{count} latents decode to {out} frames: an odd number of latents, 2N + 1, decodes to "
-        f"{2 * config.temporal}N + 1 frames"
-    )
-    if frames is None and count % 2 == 0:
-        _log.warning("%s, an even number has no first frame of its own.", advice)
-    elif frames not in {None, out}:
-        raise UserError(f"{advice}, {frames} frames were expected.")
-    return _decode(config, params, latents_BthwC)
-
-
-def _encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Array, Array]:
     def whole(video: Array) -> Array:
         step = partial(_encode_chunk, config, params["encoder"])
         return _in_chunks(step, video, ENCODE_FRAMES)
@@ -174,7 +147,35 @@ def _encode(config: VAEConfig, params: Params, video_BTHWC: Array) -> tuple[Arra
     return mean, jnp.clip(logvar, *LOGVAR_RANGE)
 
 
-def _decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
+def decode(
+    config: VAEConfig, params: Params, latents_BthwC: Array, *, frames: int | None = None
+) -> Array:
+    """Decode latents (B, t, h, w, z) to (B, ``frames_of(config, t)``, 8h, 8w, C), in about [−1, 1].
+
+    The latents are divided by ``config.scaling_factor`` again; their dtype is that of the
+    computation. If the number of expected ``frames`` is not given, an even number of latents warns.
+
+    Memory does not grow with the length of the clip, since two latents are decoded at a time. With
+    the published widths, 49 frames of 480 × 720 in float32 need 20.8 GiB besides parameters and
+    video, by XLA's memory analysis on a CPU (``python benchmarks/cogvideox_vae.py --memory``). It
+    is proportional to the pixels of a frame: with ``config.tiling``, tiles of 240 × 360 need about
+    a quarter.
+
+    Raises:
+        UserError: the latents decode to another number of frames than expected.
+    """
+    require_video(latents_BthwC, config.latent_channels, "latents_BthwC")
+    count = latents_BthwC.shape[1]
+    out = frames_of(config, count)
+    advice = (
+        f"{count} latents decode to {out} frames: an odd number of latents, 2N + 1, decodes to "
+        f"{2 * config.temporal}N + 1 frames"
+    )
+    if frames is None and count % 2 == 0:
+        _log.warning("%s, an even number has no first frame of its own.", advice)
+    elif frames not in {None, out}:
+        raise UserError(f"{advice}, {frames} frames were expected.")
+
     def whole(latents: Array) -> Array:
         step = partial(_decode_chunk, config, params["decoder"])
         return _in_chunks(step, latents, DECODE_LATENTS)
@@ -182,31 +183,10 @@ def _decode(config: VAEConfig, params: Params, latents_BthwC: Array) -> Array:
     return in_tiles(whole, latents_BthwC, config, shrink=False)
 
 
-def _in_chunks(
-    step: Callable[[Array, Params], tuple[Array, Params]], x_BTHWC: Array, size: int
-) -> Array:
-    """Run ``step(chunk, past) → (out, past)`` over chunks of time and join the outputs."""
-    batch, frames = x_BTHWC.shape[:2]
-    more = max(frames // size, 1) - 1
-    split = frames - more * size
-    first, past = step(x_BTHWC[:, :split], {})
-    if not isinstance(x_BTHWC, Tracer):
-        outs = [first]
-        for start in range(split, frames, size):
-            out, past = step(x_BTHWC[:, start : start + size], past)
-            outs.append(out)
-        return jnp.concatenate(outs, 1)
-    if not more:
-        return first
-    rest = x_BTHWC[:, split:].reshape(batch, more, size, *x_BTHWC.shape[2:])
-
-    def body(past: Params, chunk: Array) -> tuple[Params, Array]:
-        out, past = step(chunk, past)
-        return past, out
-
-    _, outs = jax.lax.scan(body, past, jnp.moveaxis(rest, 1, 0))
-    outs = jnp.moveaxis(outs, 0, 1).reshape(batch, -1, *first.shape[2:])
-    return jnp.concatenate([first, outs], 1)
+def _in_chunks(step: Any, x_BTHWC: Array, size: int) -> Array:
+    """Run chunks of ``size``, of which the first also takes the remainder."""
+    frames = x_BTHWC.shape[1]
+    return in_chunks(step, x_BTHWC, frames - (max(frames // size, 1) - 1) * size, size)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -259,31 +239,14 @@ def _resnets(
     return x_BTHWC, new
 
 
-def _shape(x: Array, channels: int, name: str) -> tuple[int, ...]:
-    if x.ndim != 5 or x.shape[-1] != channels:
-        raise UserError(
-            f"{name} has shape {tuple(x.shape)}: five axes are needed, batch, time, height, width "
-            f"and {channels} channels last."
-        )
-    if not jnp.issubdtype(x.dtype, jnp.floating):
-        raise UserError(f"{name} holds {x.dtype}: convert it to floats first.")
-    return tuple(x.shape)
-
-
 def in_tiles(
     whole: Callable[[Array], Array], x_BTHWC: Array, config: VAEConfig, *, shrink: bool
 ) -> Array:
     """Apply ``whole`` to the tiles of a video and blend, or to a video no larger than a tile.
 
-    Args:
-        whole: (B, T, H, W, C) → (B, T', H', W', C').
-        x_BTHWC: the video, or the latents.
-        config: the autoencoder; without ``config.tiling`` the video is not split.
-        shrink: whether ``whole`` encodes (pixels in, latents out) or decodes.
-
-    Returns:
-        What ``whole`` would return, up to effects at tile borders. If tiles do not overlap by a
-        whole number of latents, the size differs, as in the reference, and a warning is logged.
+    ``whole`` encodes (``shrink``: pixels in, latents out) or decodes. The result is that of the
+    whole video up to effects at tile borders. If tiles do not overlap by a whole number of latents,
+    its size differs, as in the reference, and a warning is logged.
     """
     pixels = config.tile_pixels
     latents = tuple(size // config.spatial for size in pixels)

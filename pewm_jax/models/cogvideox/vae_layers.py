@@ -4,12 +4,12 @@ A causal layer sees no later frames. The first chunk of a video is padded by rep
 frame; a later chunk by the last frames of the chunk before. These are passed on as ``past``: one
 array per convolution, nested like the parameters. ``layout`` lists the parameters: a norm of the
 decoder also has the 1×1×1 convolutions ``scale_by`` and ``shift_by`` from latents to its channels.
-Reference: ``autoencoder_kl_cogvideox.py`` of
-diffusers.
+Reference: ``autoencoder_kl_cogvideox.py`` of diffusers.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 
 import jax
@@ -17,8 +17,9 @@ import jax.numpy as jnp
 
 from pewm_jax.models.cogvideox.config import VAEConfig
 from pewm_jax.nn.layers import group_norm_affine
-from pewm_jax.nn.parameters import Leaf, convolution
-from pewm_jax.nn.video_convolution import convolve, convolve_frames, convolve_upsampled
+from pewm_jax.nn.parameters import Leaf, convolution, levels
+from pewm_jax.nn.parameters import norm as norm_leaves
+from pewm_jax.nn.video_convolution import convolve_causal, convolve_frames, convolve_upsampled
 from pewm_jax.types import Array, Params
 
 EPS = 1e-6
@@ -28,21 +29,10 @@ EPS = 1e-6
 def causal_conv(
     config: VAEConfig, params: Params, x_BTHWC: Array, past: Array | None
 ) -> tuple[Array, Array]:
-    """3×3×3 convolution over this frame and the two before, zeros around the frame.
-
-    Args:
-        config: the autoencoder (which form of the convolution).
-        params: ``kernel`` (3, 3, 3, C, D) and ``bias``.
-        x_BTHWC: (B, T, H, W, C).
-        past: (B, 2, H, W, C), the two frames before; None repeats the first frame.
-
-    Returns:
-        (B, T, H, W, D), and the next chunk's past.
-    """
+    """Convolve causally; before the first chunk (``past`` None) its first frame is repeated."""
     if past is None:
         past = jnp.repeat(x_BTHWC[:, :1], 2, axis=1)
-    padded = jnp.concatenate([past, x_BTHWC], 1)
-    return convolve(config, params, padded), padded[:, -2:]
+    return convolve_causal(config.convolution, params, x_BTHWC, past)
 
 
 def pointwise(params: Params, x: Array) -> Array:
@@ -56,18 +46,9 @@ def norm(
 ) -> Array:
     """Group norm and swish; with latents, they scale and shift the normalised values.
 
-    The reference upsamples the latents to x's size (nearest) and then maps their channels. Mapping
-    them first gives the same result with far less work.
-
-    Args:
-        params: ``scale`` and ``bias``; with latents also ``scale_by`` and ``shift_by``.
-        x_BTHWC: (B, T, H, W, C).
-        latents_BthwC: (B, t, h, w, z) this chunk's latents, or None.
-        groups: groups of channels.
-        eps: added to the variance.
-
-    Returns:
-        (B, T, H, W, C).
+    The reference upsamples the latents of the chunk (B, t, h, w, z) to x's size (nearest) and then
+    maps their channels by ``scale_by`` and ``shift_by``. Mapping them first gives the same result
+    with far less work.
     """
     factor, offset = (
         v[:, None, None, None] for v in group_norm_affine(params, x_BTHWC, groups, eps)
@@ -100,17 +81,10 @@ def resnet(
     latents_BthwC: Array | None,
     past: Params,
 ) -> tuple[Array, Params]:
-    """Residual block: norm, swish, convolution, twice.
+    """Residual block: norm, swish, convolution, twice; returned with the next chunk's past.
 
-    Args:
-        config: the autoencoder.
-        params: ``norm1, conv1, norm2, conv2`` and, where the width changes, ``shortcut``.
-        x_BTHWC: (B, T, H, W, C).
-        latents_BthwC: what the decoder's norms are conditioned on; None in the encoder.
-        past: the convolutions' past; empty in the first chunk.
-
-    Returns:
-        (B, T, H, W, D), and the next chunk's past.
+    ``latents_BthwC`` condition the decoder's norms, and are None in the encoder. ``past`` is empty
+    in the first chunk.
     """
     eps = config.eps if latents_BthwC is None else EPS
     h, new = x_BTHWC, {}
@@ -158,42 +132,26 @@ def layout(config: VAEConfig) -> dict[str, tuple[int, ...]]:
 def _encoder_leaves(config: VAEConfig) -> Iterator[Leaf]:
     widths = config.widths
     yield from convolution("encoder/conv_in", (3, 3, 3), config.in_channels, widths[0])
-    inside = widths[0]
-    for level, width in enumerate(widths):
-        where = f"encoder/down_{level}"
-        for k in range(config.resnets):
-            yield from _resnet_leaves(f"{where}/resnet_{k}", inside if k == 0 else width, width)
-        if level + 1 < len(widths):
-            yield from convolution(f"{where}/resample", (3, 3), width, width)
-        inside = width
+    yield from levels("encoder/down", widths, config.resnets, _resnet_leaves)
     for k in range(2):
-        yield from _resnet_leaves(f"encoder/mid/resnet_{k}", inside, inside)
-    yield from _norm_leaves("encoder/norm_out", inside)
-    yield from convolution("encoder/conv_out", (3, 3, 3), inside, 2 * config.latent_channels)
+        yield from _resnet_leaves(f"encoder/mid/resnet_{k}", widths[-1], widths[-1])
+    yield from norm_leaves("encoder/norm_out", widths[-1])
+    yield from convolution("encoder/conv_out", (3, 3, 3), widths[-1], 2 * config.latent_channels)
 
 
 def _decoder_leaves(config: VAEConfig) -> Iterator[Leaf]:
     widths, latent = config.widths[::-1], config.latent_channels
+    block = functools.partial(_resnet_leaves, latent=latent)
     yield from convolution("decoder/conv_in", (3, 3, 3), latent, widths[0])
     for k in range(2):
-        yield from _resnet_leaves(f"decoder/mid/resnet_{k}", widths[0], widths[0], latent)
-    inside = widths[0]
-    for level, width in enumerate(widths):
-        where = f"decoder/up_{level}"
-        for k in range(config.resnets + 1):
-            yield from _resnet_leaves(
-                f"{where}/resnet_{k}", inside if k == 0 else width, width, latent
-            )
-        if level + 1 < len(widths):
-            yield from convolution(f"{where}/resample", (3, 3), width, width)
-        inside = width
-    yield from _norm_leaves("decoder/norm_out", inside, latent)
-    yield from convolution("decoder/conv_out", (3, 3, 3), inside, config.out_channels)
+        yield from block(f"decoder/mid/resnet_{k}", widths[0], widths[0])
+    yield from levels("decoder/up", widths, config.resnets + 1, block)
+    yield from _norm_leaves("decoder/norm_out", widths[-1], latent)
+    yield from convolution("decoder/conv_out", (3, 3, 3), widths[-1], config.out_channels)
 
 
 def _norm_leaves(where: str, width: int, latent: int = 0) -> Iterator[Leaf]:
-    yield f"{where}/scale", (width,)
-    yield f"{where}/bias", (width,)
+    yield from norm_leaves(where, width)
     if latent:
         yield from convolution(f"{where}/scale_by", (1, 1, 1), latent, width)
         yield from convolution(f"{where}/shift_by", (1, 1, 1), latent, width)

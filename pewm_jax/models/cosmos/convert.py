@@ -6,7 +6,7 @@ Reference: ``CosmosTransformer3DModel`` of diffusers. The autoencoder is Wan's
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from pewm_jax.errors import UserError
@@ -18,21 +18,21 @@ from pewm_jax.models.cosmos.backbone import CosmosBackbone
 CLASS = "CosmosTransformer3DModel"
 """The reference's class."""
 WHAT = "The transformer"
-_DEFAULTS: dict[str, Any] = {
-    "in_channels": 16,
-    "out_channels": 16,
-    "num_attention_heads": 32,
-    "attention_head_dim": 128,
-    "num_layers": 28,
-    "mlp_ratio": 4.0,
-    "text_embed_dim": 1024,
-    "adaln_lora_dim": 256,
-    "max_size": (128, 240, 240),
-    "patch_size": (1, 2, 2),
-    "rope_scale": (2.0, 1.0, 1.0),
-    "concat_padding_mask": True,
+_FIELDS: dict[str, tuple[str, Any]] = {
+    "in_channels": ("in_channels", 16),
+    "out_channels": ("out_channels", 16),
+    "num_attention_heads": ("heads", 32),
+    "attention_head_dim": ("head_dim", 128),
+    "num_layers": ("layers", 28),
+    "mlp_ratio": ("mlp_ratio", 4.0),
+    "text_embed_dim": ("text_dim", 1024),
+    "adaln_lora_dim": ("lora_dim", 256),
+    "max_size": ("max_size", (128, 240, 240)),
+    "rope_scale": ("rope_scale", (2.0, 1.0, 1.0)),
+    "concat_padding_mask": ("padding_mask", True),
 }
-"""What diffusers takes for settings that a file leaves out."""
+"""Their setting → our field, and what diffusers takes for one that a file leaves out."""
+_PATCH = {"patch_size": (1, 2, 2)}
 _CHOICES: dict[str, Any] = {
     "extra_pos_embed_type": "learnable",
     "use_crossattn_projection": False,
@@ -58,8 +58,6 @@ _RULES = (
     (r"to_out/", "to_out.0/"),
     (r"ff/up/", "ff.net.0.proj/"),
     (r"ff/down/", "ff.net.2/"),
-    (r"/(kernel|scale)$", "/weight"),
-    (r"/", "."),
 )
 
 
@@ -69,42 +67,24 @@ def config_from_diffusers(values: Mapping[str, Any]) -> CosmosBackbone:
     Raises:
         UserError: another class, or a setting that is unknown or not supported.
     """
-    defaults = {**_DEFAULTS, **_CHOICES, **_ONLY}
+    checked = {**published.defaults(_FIELDS), **_PATCH}
+    defaults = {**checked, **_CHOICES, **_ONLY}
     given = published.read_settings(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
     published.require_only(given, WHAT, _ONLY)
-    published.require_kinds(given, WHAT, _DEFAULTS)
+    published.require_kinds(given, WHAT, checked)
     patch_t, rows, columns = given["patch_size"]
     if rows != columns:
         raise UserError(
             f"{WHAT}'s patch_size is {given['patch_size']!r}; only square patches are supported."
         )
-    extra = given["extra_pos_embed_type"]
-    if extra not in (None, "learnable"):
-        raise UserError(
-            f"{WHAT}'s extra_pos_embed_type is {extra!r}; only None and 'learnable' are supported."
-        )
+    published.require_choice(given, WHAT, "extra_pos_embed_type", (None, "learnable"))
     return CosmosBackbone(
-        in_channels=given["in_channels"],
-        out_channels=given["out_channels"],
-        layers=given["num_layers"],
-        heads=given["num_attention_heads"],
-        head_dim=given["attention_head_dim"],
-        mlp_ratio=float(given["mlp_ratio"]),
-        text_dim=given["text_embed_dim"],
+        **published.read_fields(_FIELDS, given),
         raw_text_dim=_raw_text(given),
-        lora_dim=given["adaln_lora_dim"],
         patch=rows,
         patch_t=patch_t,
-        max_size=_three(given["max_size"]),
-        rope_scale=_three(map(float, given["rope_scale"])),
-        learned_positions=extra == "learnable",
-        padding_mask=given["concat_padding_mask"],
+        learned_positions=given["extra_pos_embed_type"] == "learnable",
     )
-
-
-def _three(values: Iterable[Any]) -> tuple[Any, Any, Any]:
-    time, rows, columns = values
-    return time, rows, columns
 
 
 def _raw_text(given: Mapping[str, Any]) -> int:
@@ -129,18 +109,8 @@ def config_to_diffusers(config: CosmosBackbone) -> dict[str, Any]:
         "_class_name": CLASS,
         **_ONLY,
         **_WITHOUT_EFFECT,
-        "in_channels": config.in_channels,
-        "out_channels": config.out_channels,
-        "num_attention_heads": config.heads,
-        "attention_head_dim": config.head_dim,
-        "num_layers": config.layers,
-        "mlp_ratio": config.mlp_ratio,
-        "text_embed_dim": config.text_dim,
-        "adaln_lora_dim": config.lora_dim,
-        "max_size": list(config.max_size),
+        **published.write_fields(_FIELDS, config),
         "patch_size": [config.patch_t, config.patch, config.patch],
-        "rope_scale": list(config.rope_scale),
-        "concat_padding_mask": config.padding_mask,
         "extra_pos_embed_type": "learnable" if config.learned_positions else None,
         "use_crossattn_projection": config.raw_text_dim > 0,
         "crossattn_proj_in_channels": config.raw_text_dim or 1024,

@@ -5,7 +5,8 @@ differ from one latent frame to the next: known frames have nearly none. A furth
 embedding per latent frame can be added to the time embedding wherever that one modulates the
 network. This is how actions steer it (arXiv 2601.15284, Eq. 5).
 
-The blocks are scanned, so compile time does not grow with depth.
+The blocks are scanned, so compile time does not grow with depth. Norms and softmax are computed in
+float32.
 
 A memory enters the network in two places: ``memory_block`` runs after every block, and
 ``added_BND`` is added to the embedded tokens (both from ``models.interface.Readers``).
@@ -16,6 +17,7 @@ Parameters: ``patch_embed, time_embed, blocks (stacked over layers), modulate_ou
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -26,11 +28,11 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.errors import UserError
-from pewm_jax.models.cosmos import block as cosmos_block
-from pewm_jax.models.cosmos.block import Time
 from pewm_jax.models.cosmos.config import CosmosConfig
+from pewm_jax.models.interface import require_shape
+from pewm_jax.nn import attention as blocked_attention
 from pewm_jax.nn import layers, placement
-from pewm_jax.nn.layers import linear
+from pewm_jax.nn.layers import linear, rms_norm
 from pewm_jax.nn.parameters import Leaf, draw
 from pewm_jax.nn.tokens import TokenLayout, patchify
 from pewm_jax.types import Array, Params
@@ -54,9 +56,29 @@ MemoryBlock = Callable[[Any, Array, Array], Array]
 """``memory_block(params, video_BND, time_BE or time_BtE) -> video_BND``, run after a block."""
 
 
+EPS, HEAD_EPS = 1e-6, 1e-5
+"""Added to the variances of tokens, and of queries and keys."""
+BASE_FPS = 24.0
+"""Frames per second at which a latent frame is one step of the rotary embedding."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Time:
+    """The noise level as the blocks see it, one row per clip (T = 1) or per token in time.
+
+    Attributes:
+        embedding_BTE: what each block's own part of the modulation is made from.
+        shared_BTC: the shared part, 3·D channels: shift, scale, gate.
+    """
+
+    embedding_BTE: Array
+    shared_BTC: Array
+
+
 def layout(config: CosmosConfig) -> dict[str, tuple[int, ...]]:
     """Return ``{path: shape}`` of the parameters."""
-    blocks = {f"blocks/{path}": (config.layers, *s) for path, s in cosmos_block.shapes(config)}
+    blocks = {f"blocks/{path}": (config.layers, *s) for path, s in block_shapes(config)}
     return {**dict(_ends(config)), **blocks}
 
 
@@ -72,14 +94,36 @@ def _ends(config: CosmosConfig) -> Iterator[Leaf]:
     if config.learned_positions:
         for name, size in zip(("time", "rows", "columns"), config.max_grid, strict=True):
             yield f"positions/{name}", (size, width)
-    yield from cosmos_block.modulation("modulate_out", width, config.lora_dim, 2)
+    yield from modulation("modulate_out", width, config.lora_dim, 2)
     yield "proj_out/kernel", (width, cells * config.out_channels)
+
+
+def block_shapes(config: CosmosConfig) -> Iterator[Leaf]:
+    """Yield the leaves of one block."""
+    width, lora = config.width, config.lora_dim
+    for n, context in ((1, width), (2, config.text_dim)):
+        yield from modulation(f"modulate{n}", width, lora, 3)
+        yield f"attn{n}/to_q/kernel", (width, width)
+        yield f"attn{n}/to_k/kernel", (context, width)
+        yield f"attn{n}/to_v/kernel", (context, width)
+        yield f"attn{n}/to_out/kernel", (width, width)
+        yield f"attn{n}/norm_q/scale", (config.head_dim,)
+        yield f"attn{n}/norm_k/scale", (config.head_dim,)
+    yield from modulation("modulate3", width, lora, 3)
+    yield "ff/up/kernel", (width, config.hidden)
+    yield "ff/down/kernel", (config.hidden, width)
+
+
+def modulation(where: str, width: int, lora: int, parts: int) -> Iterator[Leaf]:
+    """Yield the two linear layers of a modulation of ``parts``·width channels."""
+    yield f"{where}/down/kernel", (width, lora)
+    yield f"{where}/up/kernel", (lora, parts * width)
 
 
 def init(config: CosmosConfig, key: Array) -> Params:
     """Return random parameters, float32; the tree is ``layout``'s."""
     ends_key, blocks_key = jax.random.split(key)
-    blocks = jax.vmap(lambda k: draw(dict(cosmos_block.shapes(config)), k, key_per_leaf=True))(
+    blocks = jax.vmap(lambda k: draw(dict(block_shapes(config)), k, key_per_leaf=True))(
         jax.random.split(blocks_key, config.layers)
     )
     return {**draw(dict(_ends(config)), ends_key, key_per_leaf=True), "blocks": blocks}
@@ -100,13 +144,11 @@ def apply(
     memory_params: Any = None,
     added_BND: Array | None = None,
 ) -> Array:
-    """Predict from noisy latents.
+    """Predict from noisy latents: (B, t, h, w, out_channels) in their dtype.
 
     Args:
-        config: the transformer.
-        params: its parameters.
-        latents_BthwC: (B, t, h, w, C) noisy latents, scaled; h and w are multiples of the patch, t
-            of ``patch_t``. Their dtype is the dtype of the computation.
+        latents_BthwC: scaled; h and w are multiples of the patch, t of ``patch_t``. Their dtype is
+            that of the computation.
         timesteps_Bt: (B,) noise level in the network's units, σ / (1 + σ); or (B, t'), one for
             each of the t' = t / ``patch_t`` tokens in time.
         text_BLD: (B, L, D) text tokens.
@@ -115,14 +157,11 @@ def apply(
         padding_BHWC: (B or 1, H, W, 1) 1 where a pixel is padding, of any size; None for none.
         fps: frames per second, one number; None for an image, and to count frames.
         modulation_BtE: (B, t', width) added to the time embedding of each token in time, from
-            which every block and the output layer compute their modulation; None for none.
+            which every block and the output layer compute their modulation.
         memory_block: function of the video tokens that runs after every block and reads the
             memory; tokens are in the order of ``layout_of``.
         memory_params: its parameters, stacked over layers.
         added_BND: (B, N, D) added to the embedded tokens, in the order of ``layout_of``.
-
-    Returns:
-        (B, t, h, w, out_channels) prediction in the latents' dtype.
 
     Raises:
         UserError: an argument of another shape, or a size beyond the positions.
@@ -138,7 +177,7 @@ def apply(
         "fps": (None if fps is None else jnp.asarray(fps), ((),)),
     }
     for name, (value, forms) in wanted.items():
-        _require_shape(name, value, forms)
+        require_shape(name, value, forms)
     params = {
         name: leaf if name == "blocks" else jax.tree.map(placement.constrain, leaf)
         for name, leaf in params.items()
@@ -156,24 +195,24 @@ def apply(
     x = arranged(linear(params["patch_embed"], patches))
     if added_BND is not None:
         x = x + added_BND.astype(dtype)
-    angles = order.spread(cosmos_block.angles(config, grid, fps)[None])[0]
+    angles = order.spread(rotary_angles(config, grid, fps)[None])[0]
     positions = None
     if config.learned_positions:
-        table = cosmos_block.learned_positions(params["positions"], grid).astype(dtype)
+        table = learned_positions(params["positions"], grid).astype(dtype)
         positions = order.spread(table[None])
     seen = time.embedding_BTE[:, 0] if time.embedding_BTE.shape[1] == 1 else time.embedding_BTE
 
     def body(x: Array, layer: tuple[Params, Any]) -> tuple[Array, None]:
         if positions is not None:
             x = x + positions
-        x = cosmos_block.run(config, layer[0], x, time, text, angles, order)
+        x = run_block(config, layer[0], x, time, text, angles, order)
         if memory_block is not None:
             x = memory_block(layer[1], x, seen)
         return placement.constrain(x, "batch", "tokens"), None
 
     body = jax.checkpoint(body) if config.remat else body
     x, _ = jax.lax.scan(body, x, (params["blocks"], memory_params))
-    x, _ = cosmos_block.modulate(params["modulate_out"], x, time, order)
+    x, _ = modulate(params["modulate_out"], x, time, order)
     return _unpatched(config, order.gather(linear(params["proj_out"], x)), grid)
 
 
@@ -198,7 +237,7 @@ def _time(
     wave = layers.sinusoid(times if times.ndim == 2 else times[:, None], config.width).astype(dtype)
     wave = placement.constrain(wave, "batch")
     shared = linear(inside["linear_2"], jax.nn.silu(linear(inside["linear_1"], wave)))
-    embedding = cosmos_block.rms_norm(inside["norm"], wave)
+    embedding = rms_norm(inside["norm"], wave)
     if modulation is not None:
         embedding = embedding + modulation.astype(dtype)
         shared = jnp.broadcast_to(shared, (*embedding.shape[:2], shared.shape[-1]))
@@ -226,7 +265,7 @@ def _joined(
     batch, frames, height, width, channels = latents.shape
     parts = [latents]
     if condition is not None:
-        _require_shape("condition_BthwC", condition, ((batch, frames, height, width, "C"),))
+        require_shape("condition_BthwC", condition, ((batch, frames, height, width, "C"),))
         parts.append(condition.astype(latents.dtype))
         channels += condition.shape[-1]
     if channels != config.in_channels:
@@ -239,7 +278,7 @@ def _joined(
         raise UserError("padding_BHWC was given to a network without a padding mask.")
     if config.padding_mask:
         mask = jnp.zeros((1, height, width, 1)) if padding is None else padding
-        _require_shape("padding_BHWC", mask, ((1, "H", "W", 1), (batch, "H", "W", 1)))
+        require_shape("padding_BHWC", mask, ((1, "H", "W", 1), (batch, "H", "W", 1)))
         rows, columns = (
             np.arange(new) * old // new
             for old, new in zip(mask.shape[1:3], (height, width), strict=True)
@@ -272,17 +311,96 @@ def _grid(config: CosmosConfig, shape: tuple[int, ...]) -> tuple[int, int, int]:
     return grid
 
 
-def _require_shape(
-    name: str, value: Array | None, forms: tuple[tuple[int | str, ...], ...]
-) -> None:
-    """Refuse an array of none of these shapes; a letter means any size."""
-    if value is None:
-        return
-    for form in forms:
-        if len(form) == value.ndim and all(
-            isinstance(side, str) or side == size
-            for side, size in zip(form, value.shape, strict=True)
-        ):
-            return
-    texts = " or ".join(f"({', '.join(map(str, form))})" for form in forms)
-    raise UserError(f"{name} has shape {tuple(value.shape)}: it must be {texts}.")
+def run_block(
+    config: CosmosConfig,
+    params: Params,
+    x_BND: Array,
+    time: Time,
+    text_BLD: Array,
+    angles_NR: Array,
+    layout: TokenLayout,
+) -> Array:
+    """Return the updated video tokens (B, N, D), in the order of ``layout``.
+
+    Self-attention, attention to the text and a feed-forward layer, each between a norm that is
+    modulated by the time and a gate. No layer has a bias. The modulation is a sum of two parts: one
+    that all blocks share, and one of the block's own, through a bottleneck (adaLN-LoRA).
+    """
+    normed, gate = modulate(params["modulate1"], x_BND, time, layout)
+    x = x_BND + gate * _attend(config, params["attn1"], normed, normed, angles_NR, layout)
+    x = placement.constrain(x, "batch", "tokens")
+    normed, gate = modulate(params["modulate2"], x, time, layout)
+    x = x + gate * _attend(config, params["attn2"], normed, text_BLD)
+    x = placement.constrain(x, "batch", "tokens")
+    normed, gate = modulate(params["modulate3"], x, time, layout)
+    hidden = placement.constrain(linear(params["ff"]["up"], normed), "batch", "tokens", "hidden")
+    return x + gate * linear(params["ff"]["down"], jax.nn.gelu(hidden, approximate=False))
+
+
+def modulate(
+    params: Params, x_BND: Array, time: Time, layout: TokenLayout
+) -> tuple[Array, Array | float]:
+    """Return the normalised tokens, scaled and shifted, and the gate where there is one."""
+    own = linear(params["up"], linear(params["down"], jax.nn.silu(time.embedding_BTE)))
+    parts = placement.constrain(own + time.shared_BTC[..., : own.shape[-1]], "batch")
+    if parts.shape[1] > 1:
+        parts = layout.per_token(parts)
+    shift, scale, *gate = jnp.split(parts, own.shape[-1] // x_BND.shape[-1], -1)
+    normed = layers.standardise(x_BND, EPS).astype(x_BND.dtype) * (1 + scale) + shift
+    return placement.constrain(normed, "batch", "tokens"), gate[0] if gate else 1.0
+
+
+def _attend(
+    config: CosmosConfig,
+    params: Params,
+    x_BND: Array,
+    context_BMD: Array,
+    angles_NR: Array | None = None,
+    layout: TokenLayout | None = None,
+) -> Array:
+    """Multi-head attention; queries and keys are normalised, and rotated where there are angles."""
+    q = layers.split_heads(linear(params["to_q"], x_BND), config.heads)
+    k, v = (
+        layers.split_heads(linear(params[n], context_BMD), config.heads) for n in ("to_k", "to_v")
+    )
+    q, k = rms_norm(params["norm_q"], q, HEAD_EPS), rms_norm(params["norm_k"], k, HEAD_EPS)
+    if angles_NR is not None:
+        q, k = layers.rotate_halves(q, angles_NR), layers.rotate_halves(k, angles_NR)
+    real = None if layout is None else layout.real
+    mixed = blocked_attention.attention(q, k, v, config.attention, real)
+    return linear(params["to_out"], layers.merge_heads(mixed))
+
+
+def rotary_angles(
+    config: CosmosConfig, grid: tuple[int, int, int], fps: Array | float | None
+) -> Array:
+    """Return (t·h·w, head_dim/2) rotary angles of a grid of tokens: time, rows, columns.
+
+    Args:
+        grid: tokens along time, height and width.
+        fps: frames per second of the video; None counts frames.
+    """
+    side = config.head_dim // 6 * 2
+    channels = (config.head_dim - 2 * side, side, side)
+    parts = []
+    for axis, (dim, scale) in enumerate(zip(channels, config.rope_scale, strict=True)):
+        base = 1e4 * scale ** (dim / (dim - 2))
+        frequency = np.float32(base ** -(np.arange(0, dim, 2) / dim))
+        place = jnp.arange(grid[axis], dtype=jnp.float32)
+        if axis == 0 and fps is not None:
+            place = place / jnp.asarray(fps, jnp.float32) * BASE_FPS
+        angle = jnp.expand_dims(place[:, None] * frequency, [n for n in range(3) if n != axis])
+        parts.append(jnp.broadcast_to(angle, (*grid, dim // 2)))
+    return jnp.concatenate(parts, -1).reshape(-1, config.head_dim // 2)
+
+
+def learned_positions(params: Params, grid: tuple[int, int, int]) -> Array:
+    """Return (t·h·w, D) learned positions of a grid, of length √D each, in float32."""
+    time, rows, columns = (
+        params[name][:size].astype(jnp.float32)
+        for name, size in zip(("time", "rows", "columns"), grid, strict=True)
+    )
+    table = time[:, None, None] + rows[:, None] + columns
+    length = jnp.linalg.norm(table, axis=-1, keepdims=True)
+    table = table / (EPS + length / np.float32(np.sqrt(table.shape[-1])))
+    return table.reshape(-1, table.shape[-1])

@@ -93,10 +93,6 @@ def published(
 ) -> DINOv2Config:
     """Return the configuration of a published model: ViT-S, B, L or g with patches of 14 pixels.
 
-    Args:
-        size: which one.
-        registers: the variant with four register tokens.
-
     Raises:
         ConfigError: the size does not exist.
     """

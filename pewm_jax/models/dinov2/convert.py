@@ -13,14 +13,12 @@ every other tensor must be used.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-import numpy as np
-
 from pewm_jax.errors import UserError
-from pewm_jax.io import tree
-from pewm_jax.io.published import LINEAR, SAME, Entry, Transform
+from pewm_jax.io import published, tree
+from pewm_jax.io.published import SAME, Entry, Transform
 from pewm_jax.io.sources import Source, renamed
 from pewm_jax.models.dinov2.config import HEAD_DIM, DINOv2Config
 
@@ -42,74 +40,54 @@ are split apart from these."""
 _HUB_QKV = re.compile(r"blocks\.(\d+)\.attn\.qkv\.(\w+)")
 _FIXED = {"hidden_act": "gelu", "num_channels": 3, "qkv_bias": True}
 """Settings of which only this value is implemented."""
-_NO_MATTER = frozenset(
-    [
-        "architectures",
-        "model_type",
-        "torch_dtype",
-        "dtype",
-        "transformers_version",
-        "_name_or_path",
-        "id2label",
-        "label2id",
-        "problem_type",
-        "num_labels",
-        "return_dict",
-        "output_hidden_states",
-        "output_attentions",
-        "is_encoder_decoder",
-        "chunk_size_feed_forward",
-        "torchscript",
-        "use_bfloat16",
-        "apply_layernorm",
-        "reshape_hidden_states",
-        "out_features",
-        "out_indices",
-        "stage_names",
-        "initializer_range",
-        "layerscale_value",
-        "attention_probs_dropout_prob",
-        "hidden_dropout_prob",
-        "drop_path_rate",
-        "use_mask_token",
-        "_attn_implementation_autoset",
-    ]
+_NO_MATTER = (
+    "num_labels",
+    "apply_layernorm",
+    "reshape_hidden_states",
+    "out_features",
+    "out_indices",
+    "stage_names",
+    "layerscale_value",
+    "attention_probs_dropout_prob",
+    "hidden_dropout_prob",
+    "drop_path_rate",
+    "use_mask_token",
+    "_attn_implementation_autoset",
 )
 """Settings that do not change what the network computes once it is trained."""
-_READ = frozenset(
-    [
-        "hidden_size",
-        "num_hidden_layers",
-        "num_attention_heads",
-        "mlp_ratio",
-        "layer_norm_eps",
-        "image_size",
-        "patch_size",
-        "use_swiglu_ffn",
-        "num_register_tokens",
-    ]
-)
+_NUMBERS = {
+    "num_hidden_layers": ("layers", 12),
+    "num_attention_heads": ("heads", 12),
+    "hidden_size": ("width", 768),
+    "patch_size": ("patch", 14),
+    "image_size": ("pretrained_size", 224),
+    "mlp_ratio": ("mlp_ratio", 4),
+    "num_register_tokens": ("registers", 0),
+}
+"""Their setting → our field, and what transformers takes for one that a file leaves out."""
+_WITH_REGISTERS = {"patch_size": 16, "num_register_tokens": 4}
+"""The defaults of the network with registers, where they differ."""
 
 
 def entries(config: DINOv2Config) -> list[Entry]:
     """List every tensor of ``transformers``' network and its path in our tree."""
-    p = config.patch
-    patch = Transform(
-        lambda x: np.moveaxis(x, (1, 0), (2, 3)).reshape(p * p * 3, -1),
-        lambda x: np.moveaxis(x.reshape(p, p, 3, -1), (2, 3), (1, 0)),
-    )
     row = Transform(lambda x: x[0], lambda x: x[None])
     token = Transform(lambda x: x[0, 0], lambda x: x[None, None])
+    patch, there = published.patches(config.patch), "embeddings.patch_embeddings.projection"
     found = [
         Entry("embeddings.cls_token", "cls_token", token),
         Entry("embeddings.position_embeddings", "position_embed", row),
-        Entry("embeddings.patch_embeddings.projection.weight", "patch_embed/kernel", patch),
-        Entry("embeddings.patch_embeddings.projection.bias", "patch_embed/bias"),
-        Entry("layernorm.weight", "norm/scale"),
-        Entry("layernorm.bias", "norm/bias"),
+        *published.affine(there, "patch_embed", transform=patch),
+        *published.norm("layernorm", "norm"),
     ]
     if config.registers:
         found.append(Entry("embeddings.register_tokens", "register_tokens", row))
+    for layer in range(config.layers):
+        found += _block(config, f"encoder.layer.{layer}", layer)
+    return found
+
+
+def _block(config: DINOv2Config, theirs: str, layer: int) -> Iterator[Entry]:
     up, down = ("weights_in", "weights_out") if config.swiglu else ("fc1", "fc2")
     linear = {
         "attention.attention.query": "to_q",
@@ -119,21 +97,11 @@ def entries(config: DINOv2Config) -> list[Entry]:
         f"mlp.{up}": "up",
         f"mlp.{down}": "down",
     }
-    inside = [("layer_scale1.lambda1", "scale1", SAME), ("layer_scale2.lambda1", "scale2", SAME)]
-    for theirs, ours in linear.items():
-        inside += [(f"{theirs}.weight", f"{ours}/kernel", LINEAR)]
-        inside += [(f"{theirs}.bias", f"{ours}/bias", SAME)]
-    for norm in ("norm1", "norm2"):
-        inside += [
-            (f"{norm}.weight", f"{norm}/scale", SAME),
-            (f"{norm}.bias", f"{norm}/bias", SAME),
-        ]
-    found += [
-        Entry(f"encoder.layer.{layer}.{theirs}", f"blocks/{ours}", turn, layer)
-        for layer in range(config.layers)
-        for theirs, ours, turn in inside
-    ]
-    return found
+    for there, here in linear.items():
+        yield from published.affine(f"{theirs}.{there}", f"blocks/{here}", layer)
+    for n in "12":
+        yield from published.norm(f"{theirs}.norm{n}", f"blocks/norm{n}", layer)
+        yield Entry(f"{theirs}.layer_scale{n}.lambda1", f"blocks/scale{n}", SAME, layer)
 
 
 def config_from_transformers(values: Mapping[str, Any], where: str = "config.json") -> DINOv2Config:
@@ -152,8 +120,9 @@ def config_from_transformers(values: Mapping[str, Any], where: str = "config.jso
             f"{where} is of model_type {kind!r}; this can read dinov2 and dinov2_with_registers "
             "only."
         )
-    unknown = values.keys() - _READ - _NO_MATTER - _FIXED.keys()
-    if unknown:
+    read = {*_NUMBERS, "layer_norm_eps", "use_swiglu_ffn"}
+    known = {*read, *_NO_MATTER, *published.TRANSFORMERS_METADATA, *_FIXED}
+    if unknown := values.keys() - known:
         raise UserError(
             f"{where} has settings this library does not know: {tree.listing(unknown)}; remove "
             "them if they change nothing."
@@ -168,15 +137,12 @@ def config_from_transformers(values: Mapping[str, Any], where: str = "config.jso
         raise UserError(
             f"{where} has num_register_tokens; that is model_type dinov2_with_registers."
         )
+    given = {**(_WITH_REGISTERS if registers else {}), **values}
+    if not registers:
+        given["num_register_tokens"] = 0
     return DINOv2Config(
-        layers=_number(values, "num_hidden_layers", 12, where),
-        heads=_number(values, "num_attention_heads", 12, where),
-        width=_number(values, "hidden_size", 768, where),
-        patch=_number(values, "patch_size", 16 if registers else 14, where),
-        pretrained_size=_number(values, "image_size", 224, where),
-        mlp_ratio=_number(values, "mlp_ratio", 4, where),
+        **{ours: _number(given, key, default, where) for key, (ours, default) in _NUMBERS.items()},
         swiglu=bool(values.get("use_swiglu_ffn", False)),
-        registers=_number(values, "num_register_tokens", 4, where) if registers else 0,
         antialias=registers,
         epsilon=float(values.get("layer_norm_eps", 1e-6)),
     )

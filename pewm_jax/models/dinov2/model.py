@@ -7,17 +7,21 @@ the interpolation of position embeddings by a tenth of a patch in its models wit
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import PartitionSpec as P
 
 from pewm_jax import config as configuration
-from pewm_jax.errors import UserError
+from pewm_jax.config import serialize
+from pewm_jax.config.parts import Encoder, Rules
+from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.io import weights
 from pewm_jax.models.dinov2.config import DINOv2Config
 from pewm_jax.nn import attention as blocked_attention
@@ -29,6 +33,68 @@ MEAN_3 = (0.485, 0.456, 0.406)
 """ImageNet's mean colour in [0, 1], which DINOv2 subtracts."""
 STD_3 = (0.229, 0.224, 0.225)
 """ImageNet's standard deviation of colours, by which DINOv2 divides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DINOv2EncoderConfig(Encoder):
+    """Patch tokens of a frozen DINOv2 (the paper); the weights come from a converted checkpoint."""
+
+    SHARDING: ClassVar[Rules] = (
+        (r"encoder/.*/kernel", P(None, "fsdp")),
+        (r"encoder/position_embed", P(None, "fsdp")),
+        (r"encoder/register_tokens", P(None, "fsdp")),
+        (r"encoder/blocks/scale[12]", P()),
+        (r"encoder/cls_token", P()),
+        (r"encoder/.*/(scale|bias)", P()),
+    )
+    """Weights are stored sharded and gathered for use; each device encodes its own frames."""
+    CONVERTED: ClassVar[bool] = True
+
+    size: int = 518
+    """Side in pixels of the square that images are resized to; a multiple of the patch. 518 gives
+    37 × 37 patches."""
+    network: DINOv2Config = DINOv2Config()
+    """The network."""
+
+    @property
+    def channels(self) -> int:
+        """Number of features of a patch: the network's width."""
+        return self.network.width
+
+    def grid(self, clip: Any) -> tuple[int, int]:
+        """Return the rows and columns of patches, equal for all frames, which are resized."""
+        del clip
+        return self.size // self.network.patch, self.size // self.network.patch
+
+    def __post_init__(self):
+        """Validate."""
+        require_positive(self, "memory.encoder", "size")
+        require(
+            self.size % self.network.patch == 0,
+            f"memory.encoder.size is {self.size}: use a multiple of memory.encoder.network.patch "
+            f"{self.network.patch}, 518 for the paper's 37 × 37 features.",
+        )
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters."""
+        return init(self.network, key)
+
+    def encode(self, params: Params, rgb_THWC: Array) -> Array:
+        """Return (T, size/p, size/p, D) patch tokens."""
+        images = preprocess(rgb_THWC, self.size, self.network.patch)
+        return apply(self.network, params, images)
+
+    def preprocessing(self) -> dict[str, Any]:
+        """Return what the features depend on besides the weights."""
+        return {
+            "network": serialize.to_dict(self.network),
+            "preprocessing": {
+                "size": self.size,
+                "resize": "bicubic, antialiased",
+                "mean": list(MEAN_3),
+                "std": list(STD_3),
+            },
+        }
 
 
 class Block(nn.Module):
@@ -97,19 +163,11 @@ def init(config: DINOv2Config, key: Array) -> Params:
 
 
 def apply(config: DINOv2Config, params: Params, images_BHWC: Array) -> Array:
-    """Return the patch tokens after the final layer norm.
+    """Return the patch tokens after the final layer norm, (B, H/p, W/p, D) in the images' dtype.
 
-    Images are independent, so a batch that is sharded over devices stays sharded.
-
-    Args:
-        config: the encoder.
-        params: its parameters.
-        images_BHWC: (B, H, W, 3) floats, already normalised (see ``preprocess``); H and W are
-            multiples of the patch. Their dtype is the dtype of the computation; norms and softmax
-            are in float32.
-
-    Returns:
-        (B, H/p, W/p, D) in the images' dtype.
+    Images are independent, so a batch that is sharded over devices stays sharded. The images are
+    floats from ``preprocess``; H and W are multiples of the patch. Their dtype is the dtype of the
+    computation; norms and softmax are in float32.
 
     Raises:
         UserError: a size is not a multiple of the patch, or the array is not of RGB floats.
@@ -169,10 +227,7 @@ def _blocks(config: DINOv2Config, blocks: Params, tokens_BND: Array) -> Array:
 
 
 def load(folder: Path) -> tuple[DINOv2Config, Params]:
-    """Read a folder made by ``pewm-jax convert import dinov2``.
-
-    Returns:
-        The configuration and NumPy parameters in the stored dtype.
+    """Read a folder made by ``pewm-jax convert import dinov2``: configuration and NumPy parameters.
 
     Raises:
         UserError: a file is absent or damaged, or the weights do not fit the configuration.
@@ -192,17 +247,9 @@ def load(folder: Path) -> tuple[DINOv2Config, Params]:
 def preprocess(rgb_BHWC: Array, size: int | tuple[int, int], patch: int = 14) -> Array:
     """Turn colours in [−1, 1] into the encoder's input: resized, then normalised as ImageNet.
 
-    Resizing is bicubic with antialiasing, as in the published models' image processor. Nothing is
-    cropped, so every pixel of the camera has features.
-
-    Args:
-        rgb_BHWC: (B, H, W, 3) floats in [−1, 1].
-        size: the new size in pixels, one number or (height, width), multiples of the patch; 518
-            gives 37×37 patches.
-        patch: pixels per patch.
-
-    Returns:
-        (B, *size, 3) in the dtype of the colours.
+    ``size`` in pixels is one number or (height, width), multiples of the patch; 518 gives 37×37
+    patches. Resizing is bicubic with antialiasing, as in the published models' image processor.
+    Nothing is cropped, so every pixel of the camera has features.
 
     Raises:
         UserError: a size that is not a multiple of the patch.

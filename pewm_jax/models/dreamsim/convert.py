@@ -67,13 +67,7 @@ _AROUND: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
 
 
 def read(folder: Path) -> Params:
-    """Read all encoders, with DreamSim's updates merged.
-
-    Args:
-        folder: see above.
-
-    Returns:
-        ``{encoder: parameters}`` as ``models.dreamsim.model.encode`` takes them, float32.
+    """Read all encoders, with DreamSim's updates merged: ``{encoder: parameters}``, float32.
 
     Raises:
         UserError: a file is absent or damaged, or holds other tensors than expected.

@@ -59,24 +59,16 @@ KINDS: Mapping[Encoder, Kind] = {
 
 
 def distance(params: Params, a_BHWC: Array, b_BHWC: Array) -> Array:
-    """Return DreamSim's distances, (B,) float32; 0 for equal pictures, lower is better.
+    """Return DreamSim's distances of colours in [0, 1], (B,) float32; 0 for equal pictures.
 
-    Args:
-        params: from ``models.dreamsim.convert.read``: a vision transformer for each encoder.
-        a_BHWC: (B, H, W, 3) colours in [0, 1]; resized by ``resized``.
-        b_BHWC: the same shape.
+    ``params`` are from ``models.dreamsim.convert.read``: a vision transformer for each encoder.
     """
     a, b = embed(params, a_BHWC), embed(params, b_BHWC)
     return 1 - (a * b).sum(-1)
 
 
 def embed(params: Params, rgb_BHWC: Array) -> Array:
-    """Return the joined features of pictures, (B, F) float32, centred and of length 1.
-
-    Args:
-        params: see ``distance``.
-        rgb_BHWC: (B, H, W, 3) colours in [0, 1].
-    """
+    """Return the joined features of pictures in [0, 1], (B, F) float32, centred and of length 1."""
     parts = []
     for name in ENCODERS:
         images = resized(rgb_BHWC, side(params[name]))
@@ -101,14 +93,11 @@ def side(params: Params) -> int:
 
 
 def encode(name: Encoder, params: Params, images_BHWC: Array) -> Array:
-    """Return one encoder's features of pictures, (B, F) float32.
+    """Return one encoder's features (B, F), float32, of colours in [0, 1] of its ``side``.
 
-    Args:
-        name: of the encoder.
-        params: its parameters: ``patch_embed``, ``cls_token`` (D,), ``position_embed`` (1 + N, D),
-            ``blocks`` (stacked over layers), and of the CLIPs ``norm_before``, ``norm`` and
-            ``projection`` (D, F).
-        images_BHWC: (B, S, S, 3) colours in [0, 1], of the ``side`` that it takes.
+    Its parameters are ``patch_embed``, ``cls_token`` (D,), ``position_embed`` (1 + N, D),
+    ``blocks`` (stacked over layers), and of the CLIPs ``norm_before``, ``norm`` and ``projection``
+    (D, F).
     """
     kind = KINDS[name]
     images = (images_BHWC - jnp.array(kind.mean_3)) / jnp.array(kind.std_3)

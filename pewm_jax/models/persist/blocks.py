@@ -27,9 +27,9 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.models.persist.config import BlocksConfig
 from pewm_jax.nn import attention as blocked_attention
-from pewm_jax.nn import layers, placement
+from pewm_jax.nn import layers, parameters, placement
 from pewm_jax.nn.layers import linear, rms_norm
-from pewm_jax.nn.parameters import draw
+from pewm_jax.nn.parameters import Leaf, draw
 from pewm_jax.types import Array, Params
 
 EPSILON = 1e-6
@@ -88,48 +88,38 @@ def rules(where: str) -> tuple[tuple[str, Any], ...]:
     )
 
 
-def shapes(config: BlocksConfig, parts: Parts) -> Iterator[tuple[str, tuple[int, ...]]]:
+def shapes(config: BlocksConfig, parts: Parts) -> Iterator[Leaf]:
     """Yield path and shape of every parameter of one block."""
     width, hidden = config.width, config.mlp_ratio * config.width
     sizes = {f"to_{name}": (width, width) for name in ("q", "k", "v", "out")}
     sizes |= {"up": (width, hidden), "down": (hidden, width), "modulate": (width, 6 * width)}
     for part in parts:
-        for name, shape in sizes.items():
-            yield f"{part}/{name}/kernel", shape
-            yield f"{part}/{name}/bias", shape[1:]
+        for name, (inward, outward) in sizes.items():
+            yield from parameters.linear(f"{part}/{name}", inward, outward)
         yield f"{part}/norm_q/scale", (config.head_dim,)
         yield f"{part}/norm_k/scale", (config.head_dim,)
 
 
-def end_shapes(width: int, outputs: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the embedding of time and of the layers after the blocks."""
-    made: dict[str, tuple[int, ...]] = {}
-    sizes = {"time_embed/one": (WAVES, width), "time_embed/two": (width, width)}
-    sizes |= {"modulate_out": (width, 2 * width), "proj_out": (width, outputs)}
-    for path, shape in sizes.items():
-        made[f"{path}/kernel"], made[f"{path}/bias"] = shape, shape[1:]
-    return made
+def end_shapes(width: int, outputs: int) -> Iterator[Leaf]:
+    """Yield path and shape of the embedding of time and of the layers after the blocks."""
+    yield from mlp_shapes("time_embed", WAVES, width)
+    yield from parameters.linear("modulate_out", width, 2 * width)
+    yield from parameters.linear("proj_out", width, outputs)
 
 
-def mlp_shapes(path: str, inward: int, width: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of ``mlp``: two linear layers."""
-    return {
-        f"{path}/one/kernel": (inward, width),
-        f"{path}/one/bias": (width,),
-        f"{path}/two/kernel": (width, width),
-        f"{path}/two/bias": (width,),
-    }
+def mlp_shapes(path: str, inward: int, width: int) -> Iterator[Leaf]:
+    """Yield path and shape of ``mlp``: two linear layers."""
+    yield from parameters.linear(f"{path}/one", inward, width)
+    yield from parameters.linear(f"{path}/two", width, width)
 
 
-def init(
-    config: BlocksConfig, parts: Parts, ends: dict[str, tuple[int, ...]], key: Array
-) -> Params:
-    """Return random parameters: blocks stacked over layers, and ends of the given shapes.
+def init(config: BlocksConfig, parts: Parts, ends: Iterator[Leaf], key: Array) -> Params:
+    """Return random parameters: blocks stacked over layers, and ends of these shapes.
 
     The layers of the modulation and the last layer are zero, the gates follow ``config.gates``.
     """
     ends_key, blocks_key = jax.random.split(key)
-    params = draw(ends, ends_key)
+    params = draw(dict(ends), ends_key)
     one = dict(shapes(config, parts))
     blocks = jax.vmap(lambda k: draw(one, k))(jax.random.split(blocks_key, config.layers))
     open_ = jnp.arange(6 * config.width) // config.width % 3 == 2
@@ -164,21 +154,14 @@ def run(
     known_BTN: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Run all blocks.
+    """Run all blocks on T frames; also return the cache that includes them, if there is one.
 
     Args:
-        config: the blocks.
-        parts: which parts each has.
-        params: their parameters, stacked over layers.
-        x_BTND: (B, T, N, D) tokens of T frames, those after the cache's; their dtype is the dtype
-            of the computation.
+        x_BTND: tokens of the frames after the cache's; their dtype is that of the computation.
         condition_BTD: each frame's condition, from which its modulation is made.
-        context_BTMD: (B, T, M, D) the tokens that ``cross`` attends to, each frame to its own.
+        context_BTMD: the tokens that ``cross`` attends to, each frame to its own.
         known_BTN: bool, which tokens later frames may read; None for all.
         cache: the frames before; None if there are none and none are kept.
-
-    Returns:
-        ``(x_BTND, cache)``: the updated tokens, and the cache including these frames, or None.
     """
     frames = x_BTND.shape[1]
     past = 0 if cache is None else config.context - 1
@@ -237,11 +220,7 @@ def norm(x: Array) -> Array:
 def times_of(config: BlocksConfig, first: Array, frames: int, past: int) -> tuple[Array, Array]:
     """Return rotary angles (T, head_dim/2) of frames, and the attention mask over past and present.
 
-    Args:
-        config: the blocks.
-        first: () number of the first of the frames.
-        frames: T.
-        past: slots of the frames before, of which the last one is frame ``first`` − 1.
+    ``first`` is the number of the first frame; the last of the ``past`` slots is the one before.
     """
     half = config.head_dim // 2
     frequency = np.float32(1e4) ** (-np.arange(half, dtype=np.float32) / half)

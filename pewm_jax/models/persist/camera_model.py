@@ -10,6 +10,7 @@ proj_out``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from pewm_jax.geometry.actions import CAMERA_NUMBERS, CAMERA_STEP_NUMBERS
 from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import CameraModelConfig
+from pewm_jax.nn.parameters import Leaf, linear
 from pewm_jax.types import Array, Params
 
 PARTS = ("time",)
@@ -26,17 +28,15 @@ SHARDING = frame_blocks.rules("camera_model")
 """Rules over the paths of its parameters under ``camera_model``."""
 
 
-def ends(config: CameraModelConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parameters around the blocks by path."""
+def ends(config: CameraModelConfig) -> Iterator[Leaf]:
+    """Yield path and shape of the parameters around the blocks."""
     width = config.blocks.width
-    last = frame_blocks.end_shapes(width, CAMERA_STEP_NUMBERS)
-    return {
-        "classes/kernel": (config.classes, config.embed),
-        **frame_blocks.mlp_shapes("voxels", config.inner**3 * config.embed, width),
-        **frame_blocks.mlp_shapes("camera", CAMERA_NUMBERS, width),
-        **frame_blocks.mlp_shapes("action", config.actions, width),
-        **{path: shape for path, shape in last.items() if not path.startswith("time_embed")},
-    }
+    yield "classes/kernel", (config.classes, config.embed)
+    yield from frame_blocks.mlp_shapes("voxels", config.inner**3 * config.embed, width)
+    yield from frame_blocks.mlp_shapes("camera", CAMERA_NUMBERS, width)
+    yield from frame_blocks.mlp_shapes("action", config.actions, width)
+    yield from linear("modulate_out", width, 2 * width)
+    yield from linear("proj_out", width, CAMERA_STEP_NUMBERS)
 
 
 def init(config: CameraModelConfig, key: Array) -> Params:
@@ -77,20 +77,13 @@ def apply(
     dtype: Any = jnp.float32,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict the step to each frame's camera.
+    """Predict the steps (B, T, 6) to each frame's camera, metres and radians, with the cache.
 
     Args:
-        config: the network.
-        params: its parameters.
-        classes_BTXYZ: (B, T, X, Y, Z) class ids of the frame that the action leads to; the grid or
-            its innermost part.
-        camera_BTN: (B, T, 10) numbers of the camera before the action; see ``camera_numbers``.
-        actions_BTA: (B, T, A) the action that leads to each frame.
-        dtype: of the computation.
-        cache: the frames before these; see ``frame_blocks``.
-
-    Returns:
-        ``(steps_BT6, cache)``: metres and radians, float32; the cache with these frames, or None.
+        classes_BTXYZ: class ids of the frame that the action leads to; the grid or its innermost
+            part.
+        camera_BTN: numbers of the camera before the action; see ``camera_numbers``.
+        actions_BTA: the action that leads to each frame.
 
     Raises:
         UserError: an argument of another shape.

@@ -8,6 +8,10 @@ from typing import Literal
 from pewm_jax.errors import require, require_positive
 
 
+def _require_classes(classes: int, where: str) -> None:
+    require(classes >= 2, f"{where}.classes is {classes}: use at least 2, of which one is empty.")
+
+
 @dataclasses.dataclass(frozen=True)
 class BlocksConfig:
     """The blocks shared by PERSIST's networks; by default as published."""
@@ -115,10 +119,7 @@ class VoxelVAEConfig:
         """Validate."""
         sizes = ("side", "patch", "embed", "blocks", "latent_channels")
         require_positive(self, "voxel_vae", *sizes)
-        require(
-            self.classes >= 2,
-            f"voxel_vae.classes is {self.classes}: use at least 2, of which one is empty.",
-        )
+        _require_classes(self.classes, "voxel_vae")
         for name in ("middle", "compared", "cube"):
             value = getattr(self, name)
             require(value >= 0, f"voxel_vae.{name} is {value}: use 0 or more.")
@@ -218,14 +219,7 @@ class CameraModelConfig:
     """Channels of the learned vector of a class."""
     actions: int = 23
     """Numbers of an action."""
-    units: tuple[float, float, float, float, float, float] = (
-        1.0,
-        1.0,
-        1.0,
-        1.0,
-        1.0,
-        1.0,
-    )
+    units: tuple[float, float, float, float, float, float] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     """The unit of each number of a step: forward, left and up in metres; pitch, yaw and
     field of view in radians."""
     blocks: BlocksConfig = BlocksConfig()
@@ -234,10 +228,7 @@ class CameraModelConfig:
     def __post_init__(self):
         """Validate."""
         require_positive(self, "camera_model", "inner", "embed", "actions")
-        require(
-            self.classes >= 2,
-            f"camera_model.classes is {self.classes}: use at least 2, of which one is empty.",
-        )
+        _require_classes(self.classes, "camera_model")
         require(
             len(self.units) == 6 and min(self.units) > 0,
             f"camera_model.units is {self.units}: name six numbers above 0.",
@@ -289,10 +280,7 @@ class VoxelRendererConfig:
         """Validate."""
         names = ("height", "width", "latent_channels", "rays", "layers", "kernel", "stride", "fold")
         require_positive(self, "renderer", *names, "patch")
-        require(
-            self.classes >= 2,
-            f"renderer.classes is {self.classes}: use at least 2, of which one is empty.",
-        )
+        _require_classes(self.classes, "renderer")
         require(
             self.embed >= 2 and self.embed % 2 == 0,
             f"renderer.embed is {self.embed}: use an even number.",

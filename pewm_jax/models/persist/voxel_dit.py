@@ -14,6 +14,7 @@ layers), modulate_out, proj_out``.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -23,6 +24,8 @@ from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import VoxelDiTConfig
 from pewm_jax.nn.layers import linear
+from pewm_jax.nn.parameters import Leaf
+from pewm_jax.nn.parameters import linear as linear_leaves
 from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Params
 
@@ -31,22 +34,16 @@ SHARDING = frame_blocks.rules("voxel_dit")
 """Rules over the paths of its parameters under ``voxel_dit``."""
 
 
-def ends(config: VoxelDiTConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parameters around the blocks by path."""
+def ends(config: VoxelDiTConfig) -> Iterator[Leaf]:
+    """Yield path and shape of the parameters around the blocks."""
     width, cells = config.blocks.width, config.latent_channels * config.patch**3
-    pixels = config.pixel_channels * config.pixel_patch**2
-    made: dict[str, tuple[int, ...]] = {
-        "patch_embed/kernel": (cells, width),
-        "patch_embed/bias": (width,),
-        "pixel_embed/kernel": (pixels, width),
-        "pixel_embed/bias": (width,),
-        "no_pixels/bias": (width,),
-        **frame_blocks.mlp_shapes("action", config.actions, width),
-        **frame_blocks.end_shapes(width, cells),
-    }
+    yield from linear_leaves("patch_embed", cells, width)
+    yield from linear_leaves("pixel_embed", config.pixel_channels * config.pixel_patch**2, width)
+    yield "no_pixels/bias", (width,)
+    yield from frame_blocks.mlp_shapes("action", config.actions, width)
+    yield from frame_blocks.end_shapes(width, cells)
     if config.camera_numbers:
-        made |= frame_blocks.mlp_shapes("camera", config.camera_numbers, width)
-    return made
+        yield from frame_blocks.mlp_shapes("camera", config.camera_numbers, width)
 
 
 def init(config: VoxelDiTConfig, key: Array) -> Params:
@@ -72,21 +69,20 @@ def apply(
     known_BTxyz: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict the target of the noise from noisy frames.
+    """Predict the target of the noise from noisy frames, with the cache that has these frames.
 
-    Args: config: the network. params: its parameters. latents_BTxyzC: (B, T, side, side, side, C)
-        noisy latents of T frames; their dtype is the dtype of the computation. times_BT: each
-        frame's time, in the network's units. actions_BTA: the action that leads *to* each frame;
-        zeros for the first frame of an episode. pixels_BThwC: latents of each frame's image: of the
-        frame before it, or for the first frame of an episode its own. Further channels, such as
-        rays, may be appended. camera_BTN: numbers of that image's camera; see
-        ``geometry.actions.camera_numbers``. shown_BT: bool, whether a frame has its image; None
-        means all have. known_BTxyz: bool, which latents are known; tokens of others are not read by
-        later frames. None means all are. cache: the frames before these; see ``frame_blocks``.
+    All denoising steps of a frame use the cache from before it; the cache for the next frame is
+    computed from the denoised frame. The dtype of the latents is that of the computation.
 
-    Returns: ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with
-        these frames, or None. All denoising steps of a frame use the cache from before it; the
-        cache for the next frame is computed from the denoised frame.
+    Args:
+        times_BT: each frame's time, in the network's units.
+        actions_BTA: the action that leads *to* each frame; zeros for the first frame of an episode.
+        pixels_BThwC: latents of each frame's image: of the frame before it, or for the first frame
+            of an episode its own. Further channels, such as rays, may be appended.
+        camera_BTN: numbers of that image's camera; see ``geometry.actions.camera_numbers``.
+        shown_BT: bool, whether a frame has its image; None means all have.
+        known_BTxyz: bool, which latents are known; tokens of others are not read by later frames.
+            None means all are.
 
     Raises:
         UserError: an argument of another shape, or cameras where the network takes none.
@@ -128,13 +124,8 @@ def apply(
         cache=cache,
     )
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
-    out = _cube(config, out)
+    out = unpatchify(out, *(config.latent_side,) * 3, config.patch, config.patch)
     return out.reshape(latents_BTxyzC.shape), cache
-
-
-def _cube(config: VoxelDiTConfig, tokens_BNC: Array) -> Array:
-    side, patch = config.latent_side, config.patch
-    return unpatchify(tokens_BNC, side, side, side, patch, patch)
 
 
 def _require(

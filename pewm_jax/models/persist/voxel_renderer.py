@@ -12,6 +12,7 @@ proj_out``, and ``faces`` and ``action`` where a variant has them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -26,6 +27,8 @@ from pewm_jax.models.persist import blocks as frame_blocks
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.models.persist.config import VoxelRendererConfig
 from pewm_jax.nn.layers import linear
+from pewm_jax.nn.parameters import Leaf
+from pewm_jax.nn.parameters import linear as linear_leaves
 from pewm_jax.nn.tokens import patchify, unpatchify
 from pewm_jax.types import Array, Camera, Params
 
@@ -36,22 +39,18 @@ FACES = 4
 """Axes along which a ray can enter a voxel: three, or none."""
 
 
-def ends(config: VoxelRendererConfig) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the parameters around the blocks by path."""
+def ends(config: VoxelRendererConfig) -> Iterator[Leaf]:
+    """Yield path and shape of the parameters around the blocks."""
     width, cells = config.blocks.width, config.patch**2
-    made: dict[str, tuple[int, ...]] = {
-        "classes/kernel": (config.classes, config.embed),
-        "fold/kernel": (config.kernel * config.embed, config.fold),
-        "fold/bias": (config.fold,),
-        "patch_embed/kernel": ((config.latent_channels + config.features) * cells, width),
-        "patch_embed/bias": (width,),
-        **frame_blocks.end_shapes(width, config.latent_channels * cells),
-    }
+    inputs = (config.latent_channels + config.features) * cells
+    yield "classes/kernel", (config.classes, config.embed)
+    yield from linear_leaves("fold", config.kernel * config.embed, config.fold)
+    yield from linear_leaves("patch_embed", inputs, width)
+    yield from frame_blocks.end_shapes(width, config.latent_channels * cells)
     if config.sides:
-        made["faces/kernel"] = (FACES, config.embed)
+        yield "faces/kernel", (FACES, config.embed)
     if config.actions:
-        made |= frame_blocks.mlp_shapes("action", config.actions, width)
-    return made
+        yield from frame_blocks.mlp_shapes("action", config.actions, width)
 
 
 def init(config: VoxelRendererConfig, key: Array) -> Params:
@@ -76,17 +75,11 @@ def cast_rays(
     camera: Camera,
     size: tuple[int, int],
 ) -> RayHits:
-    """Return the hits (T, h, w, L) of the rays of T cameras in T grids; distances are depths.
+    """Return the hits (T, h·r, w·r, L) of the rays of T cameras in T grids; distances are depths.
 
-    With ``rays`` r above 1 the shape is (T, h·r, w·r, L).
-
-    Args:
-        config: the network.
-        classes_TXYZ: class ids of each frame's grid.
-        low_T3: the corner of each grid with the smallest coordinates, metres.
-        cell_m: side of a voxel, metres.
-        camera: (T,) cameras.
-        size: height and width of the images that their intrinsics are for, pixels.
+    r is ``config.rays``. ``low_T3`` is the corner of each grid with the smallest coordinates and
+    ``cell_m`` the side of a voxel, metres; the cameras' intrinsics are for images of this height
+    and width.
     """
     height, width = config.height * config.rays, config.width * config.rays
     shrink = width / size[1], height / size[0]
@@ -113,15 +106,9 @@ def features(
 ) -> Array:
     """Fold layers (..., h, w, L) into channels (..., h, w, F): first all of the nearest.
 
-    With several rays per latent, first all of the first ray.
-
-    Args:
-        config: the network.
-        params: its parameters.
-        layers: the hits of the rays, from ``cast_rays``.
-        dtype: of the computation.
-        drawn_hwC: (..., h, w, C) latents of the voxels drawn in the colours of their classes,
-            where the network takes them (``config.drawn``); they are the last channels.
+    With several rays per latent, first all of the first ray. ``drawn_hwC`` are latents of the
+    voxels drawn in the colours of their classes, where the network takes them (``config.drawn``);
+    they are the last channels.
 
     Raises:
         UserError: drawn voxels where the network takes none, or none where it does.
@@ -173,21 +160,11 @@ def apply(
     actions_BTA: Array | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
-    """Predict the target of the noise from noisy latents of images.
+    """Predict the target of the noise from noisy latents of images, with the cache of these frames.
 
-    Args:
-        config: the network.
-        params: its parameters.
-        latents_BThwC: (B, T, h, w, C) noisy latents of T frames; their dtype is the dtype of the
-            computation.
-        times_BT: each frame's time, in the network's units.
-        features_BThwF: the voxels as each frame's camera sees them, from ``features``.
-        actions_BTA: the action that leads to each frame, where the network takes one.
-        cache: the frames before these; see ``frame_blocks``.
-
-    Returns:
-        ``(prediction, cache)``: the prediction in the shape of the latents, and the cache with
-        these frames, or None.
+    ``features_BThwF`` are the voxels as each frame's camera sees them, from ``features``;
+    ``actions_BTA`` lead to each frame, where the network takes actions. The dtype of the latents is
+    that of the computation.
 
     Raises:
         UserError: an argument of another shape.

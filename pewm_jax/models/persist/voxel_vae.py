@@ -137,12 +137,10 @@ def init(config: VoxelVAEConfig, key: Array) -> Params:
 
 
 def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:
-    """Return parameters that normalise latents of this mean and deviation to mean 0, variance 1.
+    """Return parameters that normalise latents to mean 0 and variance 1.
 
-    Args:
-        params: this network's.
-        mean_C: (C,) mean of each channel of the latents that ``params`` give.
-        scale_C: (C,) their standard deviation.
+    ``mean_C`` and ``scale_C`` are the mean and the standard deviation of the latents' channels that
+    ``params`` give.
     """
     before = params["latent_scale_C"]
     mean = params["latent_mean_C"] + before * mean_C
@@ -152,16 +150,10 @@ def with_statistics(params: Params, mean_C: Array, scale_C: Array) -> Params:
 def moments(
     config: VoxelVAEConfig, params: Params, classes_BXYZ: Array, dtype: jnp.dtype = jnp.float32
 ) -> tuple[Array, Array]:
-    """Return mean and log variance of the latents before they are normalised.
+    """Return mean and log variance of the latents before they are normalised, float32.
 
-    Args:
-        config: the network.
-        params: its parameters.
-        classes_BXYZ: (B, side, side, side) integer class ids.
-        dtype: of the computation.
-
-    Returns:
-        Two arrays (B, side/f, side/f, side/f, C), float32, where f is ``config.factor``.
+    Both are (B, side/f, side/f, side/f, C), where f is ``config.factor``; the grids are of integer
+    class ids.
 
     Raises:
         UserError: grids of another size.
@@ -198,14 +190,7 @@ def encode(
 def features(
     config: VoxelVAEConfig, params: Params, latents_BxyzC: Array, dtype: jnp.dtype = jnp.float32
 ) -> Array:
-    """Return the input of the layer that scores classes, (B, X, Y, Z, embed).
-
-    Args:
-        config: the network.
-        params: its parameters.
-        latents_BxyzC: normalised latents, as ``encode`` gives them.
-        dtype: of the computation.
-    """
+    """Return the input of the layer that scores classes, (B, X, Y, Z, embed), from ``encode``'s."""
     x = latents_BxyzC * params["latent_scale_C"] + params["latent_mean_C"]
     return _features(config, params["decoder"], x.astype(dtype))
 
@@ -235,13 +220,6 @@ def loss(
     dtype: jnp.dtype = jnp.float32,
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of a batch of grids: cross-entropy of every cell, and the divergence.
-
-    Args:
-        config: the network.
-        params: its parameters.
-        classes_BXYZ: (B, side, side, side) class ids.
-        key: randomness of the latents.
-        dtype: of the computation.
 
     Returns:
         ``(loss, measured)``: ``cross_entropy`` per compared cell (occupied ones weigh

@@ -6,25 +6,14 @@ The image encoder is CLIP's (``models.clip.convert``).
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from pewm_jax.errors import UserError
 from pewm_jax.io import published
-from pewm_jax.io.published import (
-    CONV,
-    LINEAR,
-    POINTWISE,
-    SAME,
-    TIME_CONV,
-    Entry,
-    Network,
-    Transform,
-    rename,
-)
+from pewm_jax.io.published import Entry, Network, Transform, rename
 from pewm_jax.models.svd import unet, vae
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
-from pewm_jax.models.svd.vae_codec import SVDVAECodec
+from pewm_jax.models.svd.unet import SVDUNetBackbone
+from pewm_jax.models.svd.vae import SVDVAECodec
 
 UNET_CLASS = "UNetSpatioTemporalConditionModel"
 """The reference's class."""
@@ -115,19 +104,21 @@ def unet_config_to_diffusers(config: SVDUNetBackbone) -> dict[str, Any]:
 
 def unet_entries(config: SVDUNetBackbone) -> list[Entry]:
     """Return one entry per tensor of the reference."""
+    rules = (*_UNET_RULES, *RULES)
     return [
-        Entry(_unet_name(path), path, _transform(path, s))
-        for path, s in unet.layout(config).items()
+        Entry(rename(path, rules), path, _transform(path, shape))
+        for path, shape in unet.layout(config).items()
     ]
 
 
 def _transform(path: str, shape: tuple[int, ...]) -> Transform:
     """Return the change of layout of a leaf."""
     if not path.endswith("/kernel"):
-        return SAME
+        return published.SAME
     if len(shape) == 2:
-        return POINTWISE if "/shortcut/" in path else LINEAR
-    return TIME_CONV if len(shape) == 3 else CONV
+        pointwise = "/shortcut/" in path or path == "encoder/quant/kernel"
+        return published.POINTWISE if pointwise else published.LINEAR
+    return published.TIME_CONV if len(shape) == 3 else published.CONV
 
 
 RULES = (
@@ -156,18 +147,6 @@ _UNET_RULES = (
 )
 
 
-def _unet_name(path: str) -> str:
-    """Turn ``up_0/resnet_1/temporal/norm1/scale`` into the reference's name."""
-    return renamed(path, (*_UNET_RULES, *RULES))
-
-
-def renamed(path: str, rules: tuple[tuple[str, str], ...]) -> str:
-    """Apply rules to a path of ours and return the reference's name."""
-    path = rename(path, rules)
-    path = re.sub(r"/(kernel|scale)$", "/weight", path)
-    return re.sub(r"\.+", ".", path.replace("/", "."))
-
-
 def _numbers(given: dict[str, Any], key: str, count: int | None) -> tuple[int, ...]:
     """Return whole numbers, one per level; a single one holds for all levels."""
     value = given[key]
@@ -183,16 +162,15 @@ VAE_CLASS = "AutoencoderKLTemporalDecoder"
 """The reference's class."""
 BLOCK = "DownEncoderBlock2D"
 """The only kind of block on the way down."""
-_VAE_DEFAULTS: dict[str, Any] = {
-    "in_channels": 3,
-    "out_channels": 3,
-    "latent_channels": 4,
-    "block_out_channels": [64],
-    "down_block_types": [BLOCK],
-    "layers_per_block": 1,
-    "scaling_factor": 0.18215,
+_VAE_FIELDS: dict[str, tuple[str, Any]] = {
+    "in_channels": ("in_channels", 3),
+    "out_channels": ("out_channels", 3),
+    "latent_channels": ("latent_channels", 4),
+    "block_out_channels": ("widths", [64]),
+    "layers_per_block": ("resnets", 1),
+    "scaling_factor": ("scaling_factor", 0.18215),
 }
-"""What diffusers takes for settings that a file leaves out."""
+"""Their setting → our field, and what diffusers takes for one that a file leaves out."""
 _VAE_WITHOUT_EFFECT = {"sample_size": 768, "force_upcast": True}
 """Settings that the network does not read, and what is written for them."""
 _VAE_RULES = (
@@ -208,30 +186,14 @@ def vae_config_from_diffusers(values: dict[str, Any]) -> SVDVAECodec:
     Raises:
         UserError: another class, or a setting that is unknown or not supported.
     """
+    checked = published.defaults(_VAE_FIELDS)
     given = published.read_settings(
-        values, "The VAE", VAE_CLASS, _VAE_DEFAULTS, _VAE_WITHOUT_EFFECT
+        values, "The VAE", VAE_CLASS, {**checked, "down_block_types": [BLOCK]}, _VAE_WITHOUT_EFFECT
     )
-    widths = given["block_out_channels"]
-    whole = ("in_channels", "out_channels", "latent_channels", "layers_per_block")
-    for key, numbers in (*((k, [given[k]]) for k in whole), ("block_out_channels", widths)):
-        if not isinstance(numbers, list | tuple) or any(type(n) is not int for n in numbers):
-            raise UserError(f"The VAE's {key} is {given[key]!r}; it must be of whole numbers.")
-    if list(given["down_block_types"]) != [BLOCK] * len(widths):
-        raise UserError(
-            f"The VAE's down_block_types is {given['down_block_types']!r}; only one {BLOCK} per "
-            "level is known."
-        )
-    factor = given["scaling_factor"]
-    if isinstance(factor, bool) or not isinstance(factor, int | float):
-        raise UserError(f"The VAE's scaling_factor is {factor!r}; it must be a number.")
-    return SVDVAECodec(
-        in_channels=given["in_channels"],
-        out_channels=given["out_channels"],
-        latent_channels=given["latent_channels"],
-        widths=tuple(widths),
-        resnets=given["layers_per_block"],
-        scaling_factor=float(factor),
-    )
+    published.require_kinds(given, "The VAE", checked)
+    only = {"down_block_types": [BLOCK] * len(given["block_out_channels"])}
+    published.require_only(given, "The VAE", only)
+    return SVDVAECodec(**published.read_fields(_VAE_FIELDS, given))
 
 
 def vae_config_to_diffusers(config: SVDVAECodec) -> dict[str, Any]:
@@ -239,26 +201,18 @@ def vae_config_to_diffusers(config: SVDVAECodec) -> dict[str, Any]:
     return {
         "_class_name": VAE_CLASS,
         **_VAE_WITHOUT_EFFECT,
-        "in_channels": config.in_channels,
-        "out_channels": config.out_channels,
-        "latent_channels": config.latent_channels,
-        "block_out_channels": list(config.widths),
+        **published.write_fields(_VAE_FIELDS, config),
         "down_block_types": [BLOCK] * len(config.widths),
-        "layers_per_block": config.resnets,
-        "scaling_factor": config.scaling_factor,
     }
 
 
 def vae_entries(config: SVDVAECodec) -> list[Entry]:
     """Return one entry per tensor of the reference."""
-    return [_vae_entry(path, shape) for path, shape in vae.layout(config).items()]
-
-
-def _vae_entry(path: str, shape: tuple[int, ...]) -> Entry:
-    """Pair a leaf with the reference's tensor."""
-    quant = path == "encoder/quant/kernel"
-    change = POINTWISE if quant else _transform(path, shape)
-    return Entry(renamed(path, (*_VAE_RULES, *RULES)), path, change)
+    rules = (*_VAE_RULES, *RULES)
+    return [
+        Entry(rename(path, rules), path, _transform(path, shape))
+        for path, shape in vae.layout(config).items()
+    ]
 
 
 UNET = Network(

@@ -14,12 +14,12 @@ from collections.abc import Iterator
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.models.svd.config import SVDUNetConfig
 from pewm_jax.nn import layers
 from pewm_jax.nn.attention import multi_head_attention
 from pewm_jax.nn.layers import group_norm_affine, layer_norm, linear, mlp
 from pewm_jax.nn.parameters import Leaf, convolution
 from pewm_jax.nn.parameters import linear as linear_leaves
+from pewm_jax.nn.parameters import mlp as mlp_leaves
 from pewm_jax.nn.parameters import norm as norm_leaves
 from pewm_jax.nn.video_convolution import SAME, convolve_frames, convolve_upsampled
 from pewm_jax.types import Array, Params
@@ -31,17 +31,7 @@ EPS = 1e-6
 
 
 def norm(params: Params, x_BTHWC: Array, eps: float, *, over_time: bool = False) -> Array:
-    """Group norm of each frame, or of all frames of a clip together.
-
-    Args:
-        params: ``scale`` and ``bias``.
-        x_BTHWC: (B, T, H, W, C).
-        eps: added to the variance.
-        over_time: whether statistics are shared by the frames.
-
-    Returns:
-        (B, T, H, W, C), float32.
-    """
+    """Group norm of each frame, or of all frames of a clip together, in float32."""
     batch, frames, *rest = x_BTHWC.shape
     x = x_BTHWC if over_time else x_BTHWC.reshape(batch * frames, 1, *rest)
     factor, offset = (v[:, None, None, None] for v in group_norm_affine(params, x, GROUPS, eps))
@@ -56,12 +46,8 @@ def active(params: Params, x_BTHWC: Array, eps: float, *, over_time: bool = Fals
 def convolve_time(params: Params, x_BTHWC: Array) -> Array:
     """Convolve each pixel over three frames, with zeros before the first and after the last.
 
-    Every frame is multiplied with the three taps at once; the products are then added to the
-    frames they belong to. Few large matrix products are what a CPU is fastest at.
-
-    Args:
-        params: ``kernel`` (3, C, D) and ``bias``.
-        x_BTHWC: (B, T, H, W, C).
+    Every frame is multiplied with the three taps of ``kernel`` (3, C, D) at once; the products are
+    then added to the frames they belong to. Few large matrix products are what a CPU is fastest at.
     """
     kernel = params["kernel"].astype(x_BTHWC.dtype)
     frames = x_BTHWC.shape[1]
@@ -75,12 +61,7 @@ def convolve_time(params: Params, x_BTHWC: Array) -> Array:
 def resnet_2d(params: Params, x_BTHWC: Array, time_BTE: Array | None, eps: float) -> Array:
     """Residual block of single frames: norm, SiLU, 3×3 convolution, twice.
 
-    Args:
-        params: ``norm1, conv1, norm2, conv2``, with a time embedding ``time``, and ``shortcut``
-            where the width changes.
-        x_BTHWC: (B, T, H, W, C).
-        time_BTE: (B, T or 1, E) SiLU of the time embedding, or None.
-        eps: added to the variances.
+    ``time_BTE`` is (B, T or 1, E), SiLU of the time embedding.
     """
     h = convolve_frames(params["conv1"], active(params["norm1"], x_BTHWC, eps), 1, SAME)
     if time_BTE is not None:
@@ -102,13 +83,9 @@ def resnet(
 ) -> Array:
     """Residual block over space, then one over time, mixed.
 
-    Args:
-        params: ``spatial``, ``temporal`` and ``mix``.
-        x_BTHWC: (B, T, H, W, C).
-        time_BTE: (B, T or 1, E) SiLU of the time embedding, or None.
-        eps: added to the variances.
-        temporal_eps: the same over time, if it differs.
-        switched: whether ``mix`` weighs the temporal branch, as in the autoencoder.
+    ``time_BTE`` is (B, T or 1, E), SiLU of the time embedding. ``temporal_eps`` is ``eps`` over
+    time, if it differs. ``switched`` tells that ``mix`` weighs the temporal branch, as in the
+    autoencoder.
     """
     x = resnet_2d(params["spatial"], x_BTHWC, time_BTE, eps)
     inside = params["temporal"]
@@ -127,11 +104,6 @@ def _temporal_weight(params: Params, dtype: jnp.dtype, *, of_time: bool) -> Arra
     return jax.nn.sigmoid(logit if of_time else -logit).astype(dtype)
 
 
-def downsample(params: Params, x_BTHWC: Array, padding: tuple = SAME) -> Array:
-    """Halve height and width by a strided convolution."""
-    return convolve_frames(params, x_BTHWC, 2, padding)
-
-
 def upsample(params: Params, x_BTHWC: Array, height: int, width: int) -> Array:
     """Repeat rows and columns up to a size, twice its own or one less, and convolve."""
     if (height, width) == tuple(2 * side for side in x_BTHWC.shape[2:4]):
@@ -143,12 +115,8 @@ def upsample(params: Params, x_BTHWC: Array, height: int, width: int) -> Array:
 def attend(params: Params, x_BTHWC: Array, image_BMD: Array, heads: int, layers_: int) -> Array:
     """Attention over the pixels of a frame, then over the frames of a pixel, mixed; residual.
 
-    Args:
-        params: ``norm, proj_in, frame_embed, spatial_0, temporal_0, …, mix, proj_out``.
-        x_BTHWC: (B, T, H, W, C).
-        image_BMD: (B, M, D) embedding of the image, which both attend to as well.
-        heads: attention heads.
-        layers_: pairs of a spatial and a temporal layer.
+    Both attend to the embedding of the image as well. There are ``layers_`` pairs of a spatial and
+    a temporal layer.
     """
     batch, frames, height, width, channels = x_BTHWC.shape
     pixels, dtype = height * width, x_BTHWC.dtype
@@ -236,25 +204,18 @@ def resnet_leaves(where: str, inside: int, outside: int, time: int = 0) -> Itera
     yield f"{where}/mix", (1,)
 
 
-def mlp_leaves(where: str, inside: int, hidden: int, outside: int) -> Iterator[Leaf]:
-    """Yield two linear layers."""
-    yield from linear_leaves(f"{where}/linear_1", inside, hidden)
-    yield from linear_leaves(f"{where}/linear_2", hidden, outside)
-
-
-def attend_leaves(config: SVDUNetConfig, where: str, level: int) -> Iterator[Leaf]:
+def attend_leaves(where: str, width: int, image_dim: int, layers_: int) -> Iterator[Leaf]:
     """Yield the attention of one level of the U-Net."""
-    width = config.widths[level]
     yield from norm_leaves(f"{where}/norm", width)
     yield from linear_leaves(f"{where}/proj_in", width, width)
     yield from mlp_leaves(f"{where}/frame_embed", width, 4 * width, width)
-    for k in range(config.layers[level]):
+    for k in range(layers_):
         for branch in ("spatial", "temporal"):
             there = f"{where}/{branch}_{k}"
             if branch == "temporal":
                 yield from norm_leaves(f"{there}/norm_in", width)
                 yield from _feed_forward_leaves(f"{there}/ff_in", width)
-            for n, dim in ((1, width), (2, config.image_dim)):
+            for n, dim in ((1, width), (2, image_dim)):
                 yield from norm_leaves(f"{there}/norm{n}", width)
                 yield f"{there}/attn{n}/to_q/kernel", (width, width)
                 yield f"{there}/attn{n}/to_k/kernel", (dim, width)

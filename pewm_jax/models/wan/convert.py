@@ -12,19 +12,9 @@ from typing import Any
 
 from pewm_jax.errors import UserError
 from pewm_jax.io import published
-from pewm_jax.io.published import (
-    CONV,
-    POINTWISE,
-    SAME,
-    TIME_CONV,
-    Entry,
-    Network,
-    Transform,
-    rename,
-)
+from pewm_jax.io.published import Entry, Network, Transform, rename
 from pewm_jax.models.wan import vae
-from pewm_jax.models.wan.codec import WanVAECodec
-from pewm_jax.models.wan.config import MEAN_16, STD_16
+from pewm_jax.models.wan.vae import MEAN_16, STD_16, WanVAECodec
 
 CLASS = "AutoencoderKLWan"
 """The reference's class."""
@@ -35,18 +25,18 @@ GAMMA_2D = Transform(lambda x: x[:, 0, 0], lambda x: x[:, None, None])
 """torch (C, 1, 1) ↔ ours (C,)."""
 POINTWISE_3D = Transform(lambda x: x[:, :, 0, 0, 0].T, lambda x: x.T[:, :, None, None, None])
 """torch (out, in, 1, 1, 1) ↔ ours (in, out)."""
-_DEFAULTS: dict[str, Any] = {
-    "base_dim": 96,
-    "z_dim": 16,
-    "dim_mult": [1, 2, 4, 4],
-    "num_res_blocks": 2,
-    "temperal_downsample": [False, True, True],
-    "latents_mean": list(MEAN_16),
-    "latents_std": list(STD_16),
-    "in_channels": 3,
-    "out_channels": 3,
+_FIELDS: dict[str, tuple[str, Any]] = {
+    "base_dim": ("base_width", 96),
+    "z_dim": ("latent_channels", 16),
+    "dim_mult": ("multiples", [1, 2, 4, 4]),
+    "num_res_blocks": ("resnets", 2),
+    "temperal_downsample": ("halves_time", [False, True, True]),
+    "latents_mean": ("latents_mean", list(MEAN_16)),
+    "latents_std": ("latents_std", list(STD_16)),
+    "in_channels": ("in_channels", 3),
+    "out_channels": ("out_channels", 3),
 }
-"""What diffusers takes for settings that a file leaves out."""
+"""Their setting → our field, and what diffusers takes for one that a file leaves out."""
 _BASE = {"decoder_base_dim": None}
 _ONLY: dict[str, Any] = {"attn_scales": [], "is_residual": False, "patch_size": None}
 """Settings of which one value is supported, which is also what diffusers takes."""
@@ -60,24 +50,17 @@ def config_from_diffusers(values: Mapping[str, Any]) -> WanVAECodec:
     Raises:
         UserError: another class, or a setting that is unknown or not supported.
     """
-    defaults = {**_DEFAULTS, **_BASE, **_ONLY}
+    checked = published.defaults(_FIELDS)
+    defaults = {**checked, **_BASE, **_ONLY}
     given = published.read_settings(values, WHAT, CLASS, defaults, _WITHOUT_EFFECT)
     published.require_only(given, WHAT, _ONLY)
-    published.require_kinds(given, WHAT, _DEFAULTS)
+    published.require_kinds(given, WHAT, checked)
     decoder = given["decoder_base_dim"]
     if decoder is not None and type(decoder) is not int:
         raise UserError(f"{WHAT}'s decoder_base_dim is {decoder!r}; it must be a whole number.")
     return WanVAECodec(
-        in_channels=given["in_channels"],
-        out_channels=given["out_channels"],
-        latent_channels=given["z_dim"],
-        base_width=given["base_dim"],
+        **published.read_fields(_FIELDS, given),
         decoder_base_width=given["base_dim"] if decoder is None else decoder,
-        multiples=tuple(given["dim_mult"]),
-        resnets=given["num_res_blocks"],
-        halves_time=tuple(given["temperal_downsample"]),
-        latents_mean=tuple(map(float, given["latents_mean"])),
-        latents_std=tuple(map(float, given["latents_std"])),
     )
 
 
@@ -90,16 +73,8 @@ def config_to_diffusers(config: WanVAECodec) -> dict[str, Any]:
     return {
         "_class_name": CLASS,
         **_ONLY,
-        "base_dim": config.base_width,
+        **published.write_fields(_FIELDS, config),
         "decoder_base_dim": None if same else config.decoder_base_width,
-        "z_dim": config.latent_channels,
-        "dim_mult": list(config.multiples),
-        "num_res_blocks": config.resnets,
-        "temperal_downsample": list(config.halves_time),
-        "latents_mean": list(config.latents_mean),
-        "latents_std": list(config.latents_std),
-        "in_channels": config.in_channels,
-        "out_channels": config.out_channels,
         "dropout": 0.0,
         "scale_factor_temporal": config.temporal,
         "scale_factor_spatial": config.spatial,
@@ -120,10 +95,10 @@ def _transform(path: str, shape: tuple[int, ...]) -> Transform:
     if path.endswith("/scale"):
         return GAMMA_2D if attends else GAMMA_3D
     if path.endswith("/bias"):
-        return SAME
+        return published.SAME
     if len(shape) == 2:
-        return POINTWISE if attends else POINTWISE_3D
-    return TIME_CONV if len(shape) == 3 else CONV
+        return published.POINTWISE if attends else POINTWISE_3D
+    return published.TIME_CONV if len(shape) == 3 else published.CONV
 
 
 def _name(config: WanVAECodec, path: str) -> str:
@@ -150,9 +125,7 @@ def _name(config: WanVAECodec, path: str) -> str:
         (r"attend_(\d+)/", r"attentions.\1/"),
         (r"to_out/", "proj/"),
         (r"shortcut/", "conv_shortcut/"),
-        (r"/kernel$", "/weight"),
         (r"/scale$", "/gamma"),
-        (r"/", "."),
     )
     return rename(path, rules)
 

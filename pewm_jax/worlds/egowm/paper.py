@@ -12,9 +12,9 @@ from pewm_jax.config.world import ClipConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
-from pewm_jax.models.svd.vae_codec import SVDVAECodec
-from pewm_jax.models.wan.codec import WanVAECodec
+from pewm_jax.models.svd.unet import SVDUNetBackbone
+from pewm_jax.models.svd.vae import SVDVAECodec
+from pewm_jax.models.wan.vae import WanVAECodec
 from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 
 NOISE = EDMConfig(sigma_data=1.0, sigma_max=700.0, target="v", sample_steps=25)

@@ -14,9 +14,9 @@ from transformers import CLIPImageProcessor, CLIPVisionConfig, CLIPVisionModelWi
 
 from pewm_jax.config import UserError
 from pewm_jax.convert import pipeline, svd
-from pewm_jax.models.clip import config as clip_config
 from pewm_jax.models.clip import convert as clip_convert
 from pewm_jax.models.clip import model
+from pewm_jax.models.clip import model as clip_config
 from tests.models.svd.references import distance, draw, randomise
 
 
@@ -77,7 +77,7 @@ def test_the_published_size_has_the_reference_s_tensors():
     config = clip_config.CLIPVisionConfig()
     with torch.device("meta"):
         network = reference("gelu", 32, 16, 1280, 5120, 224, 1024)
-    assert clip_convert.config_from_transformers(network.config.to_dict(), "it") == config
+    assert clip_convert.config_from_transformers(network.config.to_dict()) == config
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     want = {name: tuple(tensor.shape) for name, tensor in network.state_dict().items()}
     assert pipeline.expected(clip_convert.entries(config), like) == want
@@ -105,10 +105,10 @@ def test_images_are_prepared_as_by_the_pipeline(size):
 @pytest.mark.parametrize(
     ("setting", "value", "words"),
     [
-        ("hidden_act", "relu", "only gelu"),
+        ("hidden_act", "relu", "supported are gelu, quick_gelu"),
         ("model_type", "siglip", "clip_vision_model only"),
-        ("window", 3, "does not know: window"),
-        ("num_channels", 1, "only 3"),
+        ("window", 3, "not known: window"),
+        ("num_channels", 1, "only 3 is supported"),
         ("hidden_size", 2.5, "a value like 768"),
     ],
 )
@@ -116,7 +116,7 @@ def test_settings_that_are_not_supported_are_refused(pair, setting, value, words
     _, folder, _ = pair
     values = json.loads((folder / "config.json").read_text()) | {setting: value}
     with pytest.raises(UserError, match=words):
-        clip_convert.config_from_transformers(values, "it")
+        clip_convert.config_from_transformers(values)
 
 
 def test_images_of_another_shape_are_refused(pair):

@@ -252,10 +252,10 @@ def test_settings_survive_the_journey(name):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"gravity": 9.81}, "setting gravity"),
+        ({"gravity": 9.81}, "not known: gravity"),
         ({"activation_fn": "silu"}, "activation_fn is 'silu'"),
         ({"norm_eps": 1e-6}, "norm_eps"),
-        ({"num_layers": "42"}, "num_layers is '42'; it must be a whole number"),
+        ({"num_layers": "42"}, "num_layers is '42'; give a value like 30"),
         ({"patch_bias": False}, "patch_bias"),
         ({"patch_size_t": 2}, "patch_size_t with no rotary"),
         ({"use_learned_positional_embeddings": True}, "only both together"),

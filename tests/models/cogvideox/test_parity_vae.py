@@ -13,7 +13,7 @@ from pewm_jax.config import UserError
 from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.convert import VAE
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from tests import properties
 
 SHRUNKEN = {

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.models.cogvideox import vae, vae_layers
 from pewm_jax.models.cogvideox.convert import VAE
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.nn import layers, video_convolution
 from tests.helpers import randomise
 
@@ -162,8 +162,7 @@ def test_every_form_of_a_convolution_agrees(frames):
         "bias": jnp.asarray(rng.normal(size=2), jnp.float32),
     }
     volume, *others = (
-        video_convolution.convolve(dataclasses.replace(TINY, convolution=form), kernel, x)
-        for form in ("volume", "taps", "winograd")
+        video_convolution.convolve(form, kernel, x) for form in ("volume", "taps", "winograd")
     )
     for other in others:
         np.testing.assert_allclose(other, volume, atol=1e-4)
@@ -224,7 +223,7 @@ def test_only_published_names_are_known():
     ("change", "sentence"),
     [
         ({"_class_name": "AutoencoderKL"}, "AutoencoderKL"),
-        ({"colour": 1}, "unknown setting 'colour'"),
+        ({"colour": 1}, "not known: colour"),
         ({"use_quant_conv": True}, "use_quant_conv"),
         ({"act_fn": "gelu"}, "act_fn"),
         ({"scaling_factor": "much"}, "scaling_factor"),

@@ -14,8 +14,8 @@ from safetensors.numpy import load_file, save_file
 from pewm_jax.config import UserError
 from pewm_jax.convert import pipeline, svd
 from pewm_jax.models.svd import unet as model
-from pewm_jax.models.svd.backbone import SVDUNetBackbone
 from pewm_jax.models.svd.convert import DOWN, UNET, UP
+from pewm_jax.models.svd.unet import SVDUNetBackbone
 from tests.models.svd.references import distance, draw, first, randomise
 
 SHRUNKEN = {

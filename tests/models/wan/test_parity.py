@@ -12,8 +12,8 @@ from safetensors.numpy import load_file
 from pewm_jax.config import UserError
 from pewm_jax.convert import cosmos, pipeline
 from pewm_jax.models.wan import vae as model
-from pewm_jax.models.wan.codec import WanVAECodec
 from pewm_jax.models.wan.convert import VAE
+from pewm_jax.models.wan.vae import WanVAECodec
 from tests.models.cosmos.references import channels_first, channels_last
 from tests.models.svd.references import distance, draw, randomise
 
@@ -70,11 +70,11 @@ def test_inside_jit_chunks_are_scanned_with_the_same_result():
     """With a running sum in the place of a network, which is quicker to compile."""
 
     def step(chunk, past):
-        out = chunk.cumsum(1) + (0 if past is None else past["sum"])
+        out = chunk.cumsum(1) + (past["sum"] if past else 0)
         return out, {"sum": out[:, -1:]}
 
     def run(x):
-        return model._in_chunks(step, x, 4)
+        return model.in_chunks(step, x, 1, 4)
 
     x = draw(2, 13, 2, 1, 3)
     np.testing.assert_allclose(run(x), x.cumsum(1), rtol=1e-4, atol=1e-5)

@@ -16,9 +16,9 @@ from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree, weights
 from pewm_jax.memory.voxel_map import VoxelConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
-from pewm_jax.models.cogvideox.vae_codec import VAECodec
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.dinov2.config import DINOv2Config
-from pewm_jax.models.dinov2.encoder import DINOv2EncoderConfig
+from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.train import loop
 from pewm_jax.types import Clip, Control
