@@ -50,9 +50,8 @@ def score(
         log: prints a line.
 
     Returns:
-        The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` for a codec that
-        ships with the library). Scores are means over frames, then over episodes, then over scenes;
-        ``error`` is the standard error over scenes.
+        The file written, ``RUN/report/codec-SPLIT.json``. Scores are means over frames, then over
+        episodes, then over scenes; ``error`` is the standard error over scenes.
 
     Raises:
         UserError: the run, its weights or the data are missing, damaged or incompatible.
@@ -101,18 +100,12 @@ def score(
 
 
 def measures(model: CodecTask, params: Params, frames: Frames) -> dict[str, Array]:
-    """Return reconstruction errors of one episode's frames, encoded and decoded.
+    """Return reconstruction errors of one episode's frames, of any size that the codec accepts.
 
-    Args:
-        model: the world.
-        params: the codec's parameters.
-        frames: (T, H, W, …) of any size that the codec accepts, colours uint8.
-
-    Returns:
-        Per frame (T,): ``psnr`` of colour in dB; over measured pixels within the model's range,
-        ``depth_cm``, the mean absolute error in cm, and ``depth_relative`` (NaN if nothing was
-        measured); ``square_rgb`` and ``square_depth``, the mean squares of the normalised latents,
-        whose mean is about 1 if the frames resemble the training data.
+    Per frame (T,): ``psnr`` of colour in dB; over measured pixels within the model's range,
+    ``depth_cm``, the mean absolute error in cm, and ``depth_relative`` (NaN if nothing was
+    measured); ``square_rgb`` and ``square_depth``, the mean squares of the normalised latents,
+    whose mean is about 1 if the frames resemble the training data.
     """
     rgb = signal_from_rgb(frames.rgb_THWC)
     depth = jnp.asarray(frames.depth_THW)

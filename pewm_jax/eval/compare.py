@@ -34,15 +34,7 @@ data, whose location does not matter."""
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """A report read from its folder.
-
-    Attributes:
-        name: name of the run, as passed by the caller.
-        folder: the report's folder.
-        metrics: the content of ``metrics.json``.
-        samples: the scores of every clip.
-        protocol: the protocol of the evaluation.
-    """
+    """A report read from its folder; ``name`` is the run's, as passed by the caller."""
 
     name: str
     folder: Path
@@ -121,11 +113,7 @@ def compare(
 
 
 def read(name: str | Path) -> Report:
-    """Read a run's report.
-
-    Args:
-        name: a run's folder, the name of weights that ship with the library, or the folder of a
-            report itself.
+    """Read the report of a run, given by its folder, its name, or the folder of the report itself.
 
     Raises:
         UserError: there is no report, it is of another version, or its files are inconsistent.
@@ -197,14 +185,10 @@ def _require_seeds(group: Sequence[Report]) -> None:
 
 
 def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
-    """Return the content of ``comparison.json``.
+    """Return the content of ``comparison.json``, which ``docs/evaluation.md`` describes.
 
-    Args:
-        one: reports of the first model's training seeds, all of one protocol.
-        two: likewise for the second model.
-
-    Returns:
-        See ``docs/evaluation.md``; differences are first − second.
+    Differences are first − second. Each argument has the reports of one model's training seeds, all
+    of one protocol.
     """
     reports = [*one, *two]
     protocols = [report.metrics["protocol"] for report in reports]

@@ -391,16 +391,10 @@ def is_complete(
 ) -> bool:
     """Return whether a folder contains the complete report for these weights and this protocol.
 
-    Args:
-        folder: the report's folder.
-        config: the run's configuration, with overrides for the evaluation.
-        name: the fingerprint of weights and protocol.
-        none_weights: sha256 of the weights of the reference model without a memory; "" if there is
-            none.
-        extras: protocol entries of optional metrics.
-        validation: sha256 of the index of the split that chooses the reprojection's settings; "" if
-            there is none. Reports of version 0.1 do not contain it and count as incomplete: their
-            partial scores are kept, and the report is written again.
+    ``name`` is the fingerprint, ``extras`` the protocol entries of optional metrics. ``validation``
+    is the sha256 of the index of the split that chooses the reprojection's settings; reports of
+    version 0.1 do not contain it and count as incomplete: their partial scores are kept, and the
+    report is written again.
     """
     try:
         metrics = json.loads((folder / METRICS).read_text("utf-8"))
@@ -422,15 +416,10 @@ def is_complete(
 
 
 def held_out(scenes: Sequence[str], trained_on: Path) -> dict[str, Any]:
-    """Compare the names of the scored scenes with those of the training scenes.
+    """Compare the names of the scored scenes with those of the training split's scenes.
 
-    Args:
-        scenes: names of the scored scenes.
-        trained_on: folder of the training split.
-
-    Returns:
-        ``held_out``: True if no scene is shared, False if some are, None if the training data is
-        not available; ``trained_scenes``: the scored scenes that are shared.
+    Returns ``held_out``, True if no scene is shared, False if some are, None if the training data
+    is not available; and ``trained_scenes``, the scored scenes that are shared.
     """
     try:
         source = EpisodeSource(trained_on)

@@ -43,9 +43,8 @@ HOLD = 4
 """Number of video frames for which the observed image is shown."""
 MASKS_NOTE = (
     "Pixels that count as seen before are in colour, the others grey. A pixel counts as seen if "
-    "its true 3D point projects into an observed frame whose true depth agrees within the "
-    f"larger of {100 * TOLERANCE_M:.0f} cm and {100 * TOLERANCE_RELATIVE:.0f} %. No network is "
-    "involved."
+    "its true 3D point projects into an observed frame whose true depth agrees within the larger "
+    f"of {100 * TOLERANCE_M:.0f} cm and {100 * TOLERANCE_RELATIVE:.0f} %. No network is involved."
 )
 ABOVE_NOTE = (
     "Each square is one cell of the model's 3D map in its stored colour, drawn from bottom to top. "

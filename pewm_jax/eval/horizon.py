@@ -40,7 +40,6 @@ class RecordedWalk:
     """A held-out walk.
 
     Attributes:
-        name: name of the episode.
         context: (S,) observed frames, the present last.
         actions_T3: (T, 3) recorded actions after the present frame.
         truth_THWC: (T, H, W, 3) uint8 colours of the frames after these actions.
@@ -102,15 +101,10 @@ def imagine_walks(
     known: bool = False,
     label: str = "imagining",
 ) -> np.ndarray:
-    """Imagine all walks in one batch and return (B, T, H, W, 3) uint8 colours.
+    """Imagine walks of equal length in one batch; return (B, T, H, W, 3) uint8 colours.
 
-    Args:
-        config: the experiment.
-        params: its weights.
-        walks: walks of equal length.
-        memory: if False, each clip is imagined only from the last frame of the previous one.
-        known: whether a ``persist`` world starts from the recorded grid of the present frame.
-        label: label of the progress line.
+    Without ``memory`` each clip is imagined only from the last frame of the previous one. With
+    ``known`` a ``persist`` world starts from the recorded grid of the present frame.
     """
     model = config.model
     each = CHUNK if memory else model.clip.frames - 1

@@ -36,14 +36,10 @@ def how() -> dict[str, Any]:
 
 
 def within_houses(values_CX: np.ndarray, houses_C: np.ndarray) -> np.ndarray:
-    """Average the clips of each house.
+    """Return the means (H, …) of each house's clips, in the order of house indices.
 
-    Args:
-        values_CX: (C, …) a value per clip; NaN if a clip has none.
-        houses_C: (C,) index of each clip's house.
-
-    Returns:
-        (H, …) in the order of house indices; NaN if no clip of a house has a value.
+    ``values_CX`` has a value per clip (C, …), NaN if a clip has none; the mean is NaN if no clip of
+    a house has a value.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # the mean of an empty set is NaN
@@ -104,10 +100,6 @@ def p_over_houses(values_C: np.ndarray, houses_C: np.ndarray) -> float | None:
     It is twice the smaller share of samples on one side of 0, counted as (k + 1) / (draws + 1)
     (Davison & Hinkley 1997, section 4.4), so that it is below 0.05 if the 95 % interval excludes 0.
     None if fewer than two houses have a value.
-
-    Args:
-        values_C: (C,) a difference per clip; NaN if a clip has none.
-        houses_C: (C,) index of each clip's house.
     """
     means_H = within_houses(np.asarray(values_C, np.float64), np.asarray(houses_C))
     if np.isfinite(means_H).sum() < 2:
@@ -133,16 +125,10 @@ def p_over_seeds(values: Sequence[float]) -> float | None:
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Adjust p values of several comparisons by Holm's step-down method (Holm 1979).
+    """Adjust the p values of one family of comparisons by Holm's step-down method (Holm 1979).
 
     If the comparisons whose adjusted value is below α are called significant, the probability that
-    any of them is a false positive is at most α.
-
-    Args:
-        p_values: p values of one family of comparisons; None entries are not counted.
-
-    Returns:
-        The adjusted values, in the same order.
+    any of them is a false positive is at most α. None entries are not counted.
     """
     known = sorted((p, k) for k, p in enumerate(p_values) if p is not None)
     adjusted: list[float | None] = [None] * len(p_values)
@@ -213,16 +199,11 @@ def _each(by_method: Mapping[str, Any], houses_C: np.ndarray) -> dict[str, Any]:
 
 
 def over_seeds(values: Sequence[float], others: Sequence[float] = ()) -> dict[str, Any]:
-    """Return the mean over training seeds with Student's 95 % interval, or a difference.
+    """Return ``mean``, ``low`` and ``high`` over training seeds: Student's 95 % interval.
 
-    Args:
-        values: one value per training seed.
-        others: values of another model's training seeds, possibly of another number; if given, the
-            difference first − second is returned (Welch 1947, degrees of freedom rounded down).
-
-    Returns:
-        ``mean``, ``low`` and ``high``; the last two are None unless all groups have two seeds or
-        more.
+    With ``others``, the values of another model's training seeds, possibly of another number, the
+    difference first − second is returned (Welch 1947, degrees of freedom rounded down). The ends
+    are None unless all groups have two seeds or more.
     """
     groups = [np.asarray(group, np.float64) for group in (values, others) if len(group)]
     mean = float(groups[0].mean() - (groups[1].mean() if len(groups) > 1 else 0))

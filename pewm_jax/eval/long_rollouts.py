@@ -31,7 +31,6 @@ class LongRollouts:
     """Scored long rollouts; the frames of the first few are stored for display.
 
     Attributes:
-        scored: errors over all of them.
         chain: number of consecutive clips.
         shown: number of rollouts whose frames are stored.
         kept: per method ``rgb`` (shown, N, H, W, 3) uint8 and ``depth`` (shown, N, H, W) metres;

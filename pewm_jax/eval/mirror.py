@@ -70,9 +70,7 @@ class Mirror:
 def way_out(config: Config, rollouts: Sequence[ClipChoice]) -> tuple[int, str]:
     """Return the number of frames on the way out (0 for no test), and a description.
 
-    Args:
-        config: ``evaluate.mirror`` and the clip length are used; whole clips are imagined.
-        rollouts: the long rollouts.
+    ``evaluate.mirror`` and the clip length are used; whole clips are imagined.
     """
     asked, there = config.evaluate.mirror, len(rollouts[0].targets_N)
     if asked == 0:
@@ -106,16 +104,9 @@ def mirror_test(
 ) -> Mirror | None:
     """Run the mirror test with every method that is a network (first seed); None if it is skipped.
 
-    Results in ``cache`` are reused; several processes share the work.
-
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        methods: the methods.
-        cache: where results are stored.
-        rollouts: the long rollouts, whose first frames are the paths.
-        measures: metrics that compare both visits (``metrics.selection.select_revisits``).
-        log: prints a line.
+    The first frames of the long rollouts are the paths, ``measures``
+    (``metrics.selection.select_revisits``) compare both visits. Results in ``cache`` are reused;
+    several processes share the work.
 
     Raises:
         UserError: as for ``scoring.score_table``.

@@ -33,17 +33,12 @@ def make_preview(
     Previews are optional: without validation data, or if it is too short, a line is logged and no
     previews are made.
 
-    Args:
-        config: the experiment; clips come from ``data.path``/validation.
-        run: the run's folder; images and videos go to its folder ``previews/``.
-        log: prints the reason if there are no previews.
-
     Returns:
         ``preview(params, stage, step)``. It imagines the clips with the current weights and
         measures their PSNR with its map and with an empty map, or, in a stage without memory (such
-        as PEWM's stage 1), of the model without a map. It writes ``previews/stage2-000250.png``
-        with the rows ground truth, with its map, empty map, and ``previews/stage2-000250.mp4``, the
-        same side by side. It is compiled once per stage.
+        as PEWM's stage 1), of the model without a map. It writes ``previews/stage2-000250.png`` in
+        the run's folder with the rows ground truth, with its map, empty map, and
+        ``previews/stage2-000250.mp4``, the same side by side. It is compiled once per stage.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)

@@ -79,17 +79,10 @@ CANDIDATES = (
 
 
 def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> Frames:
-    """Render observed frames from other cameras.
+    """Render S observed frames from N other cameras, of images of the same size.
 
-    Args:
-        settings: rendering settings (static under jit).
-        context: S observed frames, colours uint8 or float in [−1, 1]; pixels without depth, such as
-            those of padding frames, are ignored.
-        camera: (N,) cameras of images of the context's size.
-
-    Returns:
-        N frames, colours float32 in [−1, 1], depth in metres. An image without any observed point
-        is black and has no depth.
+    Colours are float32 in [−1, 1]. Pixels without depth, such as those of padding frames, are
+    ignored. An image without any observed point is black and has no depth.
     """
     view = views.fill_nearest(draw(settings, context, camera))
     return Frames(2 * view.features_THWF - 1, view.depth_THW, camera)
@@ -123,13 +116,7 @@ def draw(settings: ReprojectSettings, context: Frames, camera: Camera) -> View:
 
 @functools.partial(jax.jit, static_argnums=0)
 def reproject_batch(settings: ReprojectSettings, context: Frames, camera: Camera) -> Frames:
-    """Render B clips in sequence, because the data of one clip fits a CPU cache.
-
-    Args:
-        settings: as for ``reproject``.
-        context: (B, S) observed frames.
-        camera: (B, N) cameras.
-    """
+    """Render B clips in sequence, because the data of one clip fits a CPU cache."""
 
     def one(clip: tuple[Frames, Camera]) -> tuple[Array, Array]:
         frames = reproject(settings, *clip)
@@ -147,14 +134,12 @@ VERSION = 1
 
 @dataclasses.dataclass(frozen=True)
 class ReprojectChoice:
-    """The chosen settings, and the reason.
+    """The chosen settings, and the reason as a sentence.
 
     Attributes:
-        settings: the chosen settings.
         scores: the name of each candidate → mean PSNR over all pixels of the clips, dB; empty if
             none could be tried.
         clips: number of clips they were tried on.
-        why: the reason, as a sentence.
         data: sha256 of the index of the validation split; "" if there is none.
     """
 
@@ -193,11 +178,6 @@ def choose_settings(
     Clips are cut as in training, the same at every call: one from each episode, then a second one,
     and so on. Scores are stored in ``cache``. Without a validation split whose clips fit the model,
     the default settings are used.
-
-    Args:
-        config: the experiment.
-        cache: where scores are stored.
-        log: prints a line.
     """
     folder, data = Path(config.data.path) / SPLIT, data_hash(config)
     try:
@@ -239,11 +219,7 @@ def _piece(config: Config, data: str) -> str:
 
 
 def _cut(config: Config, episodes: EpisodeSource) -> Clip:
-    """Cut at most ``CLIPS`` clips as in training, in a fixed order.
-
-    Raises:
-        UserError: there is no clip, or the frames have another size than the model's.
-    """
+    """Cut at most ``CLIPS`` clips as in training, in a fixed order; raise if there is none."""
     rng, cut = np.random.default_rng(0), []
     size = (config.model.clip.height, config.model.clip.width)
     for turn in range(CLIPS if len(episodes) else 0):

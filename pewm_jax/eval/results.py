@@ -231,13 +231,10 @@ frames of long rollouts, (1, rollouts, long horizon)."""
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """The content of ``samples.npz``.
+    """The content of ``samples.npz``: the scores by name, and what they are of.
 
-    Attributes:
-        about: ``version``, ``protocol_sha256``, ``weights_sha256``, ``lpips_weights_sha256``,
-            ``seeds``, ``clustered_by``, and ``clips`` and ``rollouts``: name, scene and start of
-            each.
-        arrays: the scores by name.
+    ``about`` has ``version``, ``protocol_sha256``, ``weights_sha256``, ``lpips_weights_sha256``,
+    ``seeds``, ``clustered_by``, and ``clips`` and ``rollouts``: name, scene and start of each.
     """
 
     about: Mapping[str, Any]
@@ -264,13 +261,7 @@ class Samples:
 
 
 def gather_samples(scored: Scored, long: LongRollouts, **facts: Any) -> Samples:
-    """Return the scores of every clip, frame and long rollout.
-
-    Args:
-        scored: errors of the clips.
-        long: errors of the long rollouts.
-        facts: the hashes and seeds of ``Samples.about``.
-    """
+    """Return the scores of every clip, frame and long rollout, with ``facts`` in ``about``."""
     arrays = {}
     for method, sums_SCT39 in scored.sums.items():
         arrays |= _score_arrays("clips", method, sums_SCT39.sum(2)) | _score_arrays(

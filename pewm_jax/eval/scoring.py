@@ -68,10 +68,10 @@ class Scored:
 
 @dataclasses.dataclass(frozen=True)
 class Tracked:
-    """Ground truth of a clip for SCS.
+    """Ground truth of a clip for SCS, of its present frame and the N frames to imagine.
 
     Attributes:
-        ids_THW: (T, H, W) instance ids of the present frame and the N frames to imagine.
+        ids_THW: instance ids.
         things: ids of the objects that may be tracked, or None for all.
         visible_T: (T,) bool, whether each frame shows a point that the present frame shows.
     """
@@ -81,12 +81,7 @@ class Tracked:
     visible_T: np.ndarray
 
     def score(self, measure: Consistency, video_THWC: np.ndarray) -> np.ndarray:
-        """Return (T,) values: SCS of a clip, then of each of its frames but the first.
-
-        Args:
-            measure: SCS with a segmenter.
-            video_THWC: (T, H, W, 3) uint8, the present frame and the N imagined ones.
-        """
+        """Return (T,) values: SCS of a uint8 clip, then of each of its frames but the first."""
         found = measure(video_THWC, object_masks(self.ids_THW, self.things), self.visible_T)
         return np.concatenate([average(found)[None], average(found, 0)])
 
@@ -158,13 +153,7 @@ def load_batch(
 ) -> Batch:
     """Read a batch of clips starting at index ``first``, with their seen-before masks.
 
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        choices: the clips.
-        first: index of the first clip.
-        cameras: see ``load_clip``.
-        track: whether to read the instance ids, for SCS.
+    With ``track`` the instance ids are read, for SCS.
 
     Raises:
         UserError: see ``load_clip``; or ids are requested and an episode has none.
@@ -189,14 +178,10 @@ def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """A unit of work: one batch of clips, one method, one seed, one kind of measurement.
+    """A unit of work: one batch of clips, one method (or ``truth``), one seed, one measurement.
 
-    Attributes:
-        method: one of ``Methods.names``, or ``truth``.
-        seed: seed of the sampling noise.
-        first: index of the batch's first clip.
-        measured: ``sums`` of the errors, ``features`` for the distances of videos, or ``structure``
-            for SCS.
+    ``first`` is the index of the batch's first clip; ``measured`` is ``sums`` of the errors,
+    ``features`` for the distances of videos, or ``structure`` for SCS.
     """
 
     method: str
@@ -234,22 +219,11 @@ def score_table(
     """Score ``evaluate.clips`` chains of ``evaluate.chain`` clips by method and seed.
 
     Results in ``cache`` are reused. Several processes share the work, and all return the whole
-    table.
-
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        methods: the methods.
-        cache: where results are stored.
-        log: prints a line.
-        lpips: LPIPS; None to skip it.
-        choices: the clips; by default those of ``choose``.
-        i3d: the network of FVD; None to skip the features of whole clips.
-        structure: SCS; None to skip it.
+    table. What is None is not measured; without ``choices`` the clips are those of ``choose``.
 
     Raises:
-        UserError: no episode is long enough, the data is inconsistent or does not fit the model,
-            or the model's output is not finite.
+        UserError: no episode is long enough, the data is inconsistent or does not fit the model, or
+            the model's output is not finite.
     """
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)

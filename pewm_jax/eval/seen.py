@@ -22,21 +22,13 @@ def _agrees(depth_P: Array, z_P: Array) -> Array:
 
 
 def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array:
-    """Return which points are visible in a depth image.
+    """Return which points (P,) are visible in a depth image.
 
     A point is visible if it projects inside the image, in front of the camera, and its depth agrees
     with the image there: either with the nearest pixel, or with 1/depth interpolated between the
     four surrounding pixels. (On a plane 1/depth is linear in the image. So a floor seen at a
     grazing angle is recognised, although its depth changes by more than the tolerance from row to
-    row.)
-
-    Args:
-        points_world_P3: (P, 3) points in the world, metres.
-        depth_HW: (H, W) z-depth, metres, 0 = no measurement.
-        camera: the image's camera.
-
-    Returns:
-        (P,) bool.
+    row.) Depths are z, metres; 0 = no measurement.
     """
     height, width = depth_HW.shape
     uv, z = project(points_world_P3, camera)
@@ -63,14 +55,9 @@ def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array
 
 
 def seen_masks(target: Frames, context: Frames) -> tuple[Array, Array]:
-    """Return masks of the pixels seen before and never seen.
+    """Return the bool masks ``(seen_THW, unseen_THW)`` of the pixels seen before and never seen.
 
-    Args:
-        target: T frames with true depth and poses.
-        context: S frames observed earlier, with true depth and poses.
-
-    Returns:
-        ``(seen_THW, unseen_THW)``, bool. A pixel without depth is in neither.
+    Both arguments have true depth and poses. A pixel without depth is in neither.
     """
     depth_THW = jnp.asarray(target.depth_THW)
     points = unproject(depth_THW, target.camera).reshape(-1, 3)

@@ -28,14 +28,10 @@ LEAST_SHARE = 0.01
 
 
 def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
-    """Convert sums to scores.
+    """Convert sums (..., 3, 9) of ``error_sums``, possibly summed over frames, to scores.
 
-    Args:
-        sums: (..., 3, 9) from ``error_sums``, possibly summed over frames.
-
-    Returns:
-        ``scores[mask][metric]`` of shape (...), NaN if the mask covers too little; ``lpips`` only
-        under ``all``, and only if it was measured.
+    ``scores[mask][metric]`` has shape (...), NaN if the mask covers too little; ``lpips`` is only
+    under ``all``, and only if it was measured.
     """
     result: dict[str, dict[str, np.ndarray]] = {}
     everything = sums[..., MASKS.index("all"), SUMS.index("colours")]
@@ -60,15 +56,10 @@ def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
 
 
 def summary(values: np.ndarray, clusters: np.ndarray) -> dict[str, Any]:
-    """Return the average over clips and its standard error.
+    """Return the average of a value per clip, NaN if a clip has no score.
 
-    Args:
-        values: (clips,) one value per clip, NaN if a clip has no score.
-        clusters: (clips,) the scene (or episode) each clip comes from.
-
-    Returns:
-        ``mean``; ``stderr``, clustered (None if fewer than two clusters have a value); and ``n``,
-        the number of clips with a value.
+    Returns ``mean``; ``stderr``, clustered by ``clusters``, the scene (or episode) of each clip
+    (None if fewer than two clusters have a value); and ``n``, the number of clips with a value.
     """
     known = np.isfinite(values)
     values, clusters = values[known], clusters[known]
@@ -86,15 +77,7 @@ def summary(values: np.ndarray, clusters: np.ndarray) -> dict[str, Any]:
 
 
 def table(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
-    """Score every method under every mask.
-
-    Args:
-        sums: method → (seeds, clips, T, 3, 9).
-        clusters: (clips,) the scene (or episode) each clip comes from.
-
-    Returns:
-        ``results[method][mask][metric] = {mean, stderr, n}``.
-    """
+    """Return ``results[method][mask][metric] = {mean, stderr, n}``; arguments as for ``margin``."""
     results: dict[str, Any] = {}
     for method, sums_SCT39 in sums.items():
         by_mask = scores(sums_SCT39.sum(2))
@@ -151,14 +134,9 @@ def margins(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, A
 def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
     """Return how PSNR over pixels seen before changes along long rollouts.
 
-    Args:
-        sums: method → (seeds, rollouts, N, 3, 9).
-        clusters: (rollouts,) the scene (or episode) each comes from.
-
-    Returns:
-        ``[method]``: ``quarters``, the scores of the four quarters of the frames; and ``first16``,
-        ``last16`` and ``difference``, the last 16 frames minus the first 16, paired by rollout, or
-        None if a rollout has fewer than 32 frames. Each is ``{mean, stderr, n}``.
+    ``[method]``: ``quarters``, the scores of the four quarters of the frames; and ``first16``,
+    ``last16`` and ``difference``, the last 16 frames minus the first 16, paired by rollout, or None
+    if a rollout has fewer than 32 frames. Each is ``{mean, stderr, n}``.
     """
 
     def of(sums_SCT39: np.ndarray) -> np.ndarray:
@@ -177,15 +155,9 @@ def drift(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any
 
 
 def per_frame(sums: Mapping[str, np.ndarray], clusters: np.ndarray) -> dict[str, Any]:
-    """Score every frame index separately.
+    """Score every frame index separately; entry 0 is the first imagined frame.
 
-    Args:
-        sums: method → (seeds, clips, T, 3, 9).
-        clusters: (clips,) the scene (or episode) each clip comes from.
-
-    Returns:
-        ``[method][mask][metric] = {mean: [T], stderr: [T], n: [T]}``; entry 0 is the first
-        imagined frame. Entries are None if no clip has a score.
+    ``[method][mask][metric] = {mean: [T], stderr: [T], n: [T]}``, None if no clip has a score.
     """
     result: dict[str, Any] = {}
     for method, sums_SCT39 in sums.items():

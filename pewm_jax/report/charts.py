@@ -72,12 +72,8 @@ class Chart(Protocol):
 class Line:
     """A curve with a band around it.
 
-    Attributes:
-        name: label at its end.
-        colour: any matplotlib colour.
-        values: one per position, None if missing.
-        low: the lower edge of the band, None where there is none; empty for no band.
-        high: its upper edge.
+    Values and edges of the band are one per position, None where there is none; ``name`` is the
+    label at its end.
     """
 
     name: str
@@ -102,8 +98,6 @@ class LineChart:
     """Curves over positions.
 
     Attributes:
-        title: the title.
-        x_label: label of the horizontal axis.
         lines: the curves, with one value per position.
         x: the positions; 1, 2, 3, … by default.
         unit: unit of the values, shown in the title.
@@ -177,13 +171,7 @@ class IntervalRow:
 
 @dataclasses.dataclass(frozen=True)
 class IntervalChart:
-    """Means with their intervals, stacked vertically.
-
-    Attributes:
-        title: the title.
-        caption: a line below the title.
-        rows: the rows, from top to bottom.
-    """
+    """Means with their intervals, stacked vertically from top to bottom."""
 
     title: str
     caption: str

@@ -41,13 +41,8 @@ NOT_COMPARED = (
 def side_by_side(long_horizon: int, one: Path, two: Path) -> list[np.ndarray]:
     """Draw the long rollouts shown in both reports: ground truth, first run, second run.
 
-    Args:
-        long_horizon: imagined frames of a long rollout.
-        one: folder of the first one's report.
-        two: folder of the second one's.
-
-    Returns:
-        An image for each rollout whose frames both reports have.
+    Returns an image for each rollout, of ``long_horizon`` imagined frames, whose images both
+    reports' folders have.
     """
     steps = picture_steps(long_horizon)
     names = ["observed" if step == 0 else f"step {step}" for step in steps]
@@ -76,11 +71,7 @@ def _own(report: Path, index: int) -> Path:
 
 
 def sentences(content: Mapping[str, Any]) -> list[str]:
-    """Return the sentences of the comparison, for the page and the terminal.
-
-    Args:
-        content: content of ``comparison.json``.
-    """
+    """Return the sentences of ``comparison.json``, for the page and the terminal."""
     a, b = (content[side]["name"] for side in ("a", "b"))
     return [
         f"Over pixels {MASK_NAMES[mask]}: {outcome(content['differences']['clips'][mask], a, b)}"
@@ -111,10 +102,7 @@ def _samplers(content: Mapping[str, Any]) -> list[str]:
 def outcome(entries: Mapping[str, Any], one: str, two: str) -> str:
     """Return the second part of a sentence that says whether the first run's PSNR is higher.
 
-    Args:
-        entries: ``[metric]`` of first − second.
-        one: name of the first.
-        two: name of the second.
+    ``entries`` are ``[metric]`` of first − second.
     """
     found = entries["psnr"]
     if found["mean"] is None:
@@ -133,12 +121,7 @@ def outcome(entries: Mapping[str, Any], one: str, two: str) -> str:
 
 
 def comparison_page(content: Mapping[str, Any], pictures: Sequence[np.ndarray]) -> str:
-    """Return the page as HTML.
-
-    Args:
-        content: content of ``comparison.json``.
-        pictures: images of ``side_by_side``.
-    """
+    """Return the page as HTML."""
     first, *others = sentences(content)
     title = "\n".join(f"{side}: {content[side]['name']}" for side in ("a", "b"))
     opening = [Text(INTRODUCTION, "quiet"), Text(first, "lead"), Bullets(others)]
@@ -158,8 +141,7 @@ def _stills(pictures: Sequence[np.ndarray]) -> Section:
         return Section("", [Text("The two reports have no frames in common to show.", "quiet")])
     text = (
         "Long rollouts, the first of the protocol (not selected): ground truth, then each model "
-        "(with "
-        "its map, if it has one), which continues from its own last frame."
+        "(with its map, if it has one), which continues from its own last frame."
     )
     figures = [Figure(png(picture), alt="truth, a, b") for picture in pictures]
     return Section("Side by side", [Text(text), *figures])
@@ -215,8 +197,7 @@ def _seeds(content: Mapping[str, Any]) -> Section:
         rows.append(row("a − b", "", with_interval(found, 2, sign=True), highlight=True))
     note = (
         "In brackets Student's 95 % interval over training seeds: the variation between trainings, "
-        "in "
-        "these houses. It does not cover other houses, and the interval over houses does not "
+        "in these houses. It does not cover other houses, and the interval over houses does not "
         "cover other trainings."
     )
     table = Table(["PSNR, dB", "seed: mean over houses", "over seeds"], rows)

@@ -84,12 +84,9 @@ class Gallery:
         videos: (caption, MP4) of each long rollout.
         strip: frames of one rollout in rows: ground truth, with its map, empty map, reprojected;
             for a model without a memory one row instead of two.
-        strip_note: which rollout and which frames they are.
         moving: all frames of that rollout side by side, a GIF.
         masks: the same ground-truth frames with never-seen pixels greyed out.
-        masks_note: what counts as seen before.
         above: the map from above, before and after that rollout; None without a memory.
-        above_note: what is omitted in it.
         rows: for each rollout shown, the frames of ``truth`` and of each method at the steps of
             ``strip``, side by side in one image and at full size.
     """
@@ -106,12 +103,7 @@ class Gallery:
 
 
 def evaluation_page(metrics: Mapping[str, Any], gallery: Gallery) -> str:
-    """Return the page as HTML.
-
-    Args:
-        metrics: the content of ``metrics.json``.
-        gallery: images and videos.
-    """
+    """Return the page of ``metrics.json``, with images and videos, as HTML."""
     first, *others = summary_lines(metrics)
     opening = [
         Text(introduction(metrics["protocol"]), "quiet"),
@@ -262,9 +254,8 @@ def steering(metrics: Mapping[str, Any]) -> Section | None:
     note = (
         f"{found['clips']} walks with the same noise: {100 * found['forward']:.0f} % of their "
         "steps go forward. Another clip's actions are those of a clip in another house; they "
-        "differ in "
-        f"{100 * found['different']:.0f} % of the steps. Means over houses, in brackets the "
-        "interval of a bootstrap over them. A world that follows its actions is closest to the "
+        f"differ in {100 * found['different']:.0f} % of the steps. Means over houses, in brackets "
+        "the interval of a bootstrap over them. A world that follows its actions is closest to the "
         "ground truth with the true ones."
     )
     blocks = [TableBlock(Table(heads, rows)), Text(note, "quiet")]

@@ -33,12 +33,9 @@ def write(
 ) -> Path:
     """Write the report and return the page's path.
 
-    Args:
-        folder: output folder.
-        facts: plain values: ``psnr`` and optionally ``distances`` by method, ``edits``,
-            ``protocol``.
-        videos: method → (B, T, H, W, 3) uint8 colours, ``truth`` first.
-        ends: last frames of the segments.
+    ``facts`` are plain values: ``psnr`` and optionally ``distances`` by method, ``edits``,
+    ``protocol``; ``videos`` are (B, T, H, W, 3) uint8 colours by method, ``truth`` first; ``ends``
+    the last frames of the segments.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(folder / "horizon.json") as partial:

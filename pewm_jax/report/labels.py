@@ -64,8 +64,7 @@ ACTIONS_NAMES = {
 NONE_HOW = (
     "There is no row for a model trained equally long without a memory: train one with the same "
     "clip, codec and number of steps, all in stage 1 (--train.stage1.steps N --train.stage2.steps "
-    "0), "
-    "and give its folder by --none."
+    "0), and give its folder by --none."
 )
 NONE_LACKING = (
     "There is no row for a model trained equally long without a memory: give the folder of one "
@@ -80,12 +79,7 @@ def own_method(names: Iterable[str]) -> str:
 
 
 def heading(metric: str, protocol: Mapping[str, Any]) -> str:
-    """Return a metric's heading: LPIPS with the name of its network.
-
-    Args:
-        metric: key of ``METRIC_NAMES``.
-        protocol: entry ``protocol`` of ``metrics.json``.
-    """
+    """Return a metric's heading, for LPIPS with its network; ``protocol`` is a report's entry."""
     text, network = METRIC_NAMES[metric][0], protocol.get("lpips_name")
     return text.replace("LPIPS", network) if network else text
 
@@ -122,10 +116,7 @@ def format_verdict(entry: Mapping[str, Any], where: str) -> str:
 def format_comparison(margin: Mapping[str, Any], rival: str, own: str = "memory") -> str:
     """Return a sentence that compares the model with another method, per mask.
 
-    Args:
-        margin: ``[mask]["psnr"]`` of the model minus the rival.
-        rival: key of ``RIVALS``.
-        own: key of ``OWN_NAMES``.
+    ``margin`` is ``[mask]["psnr"]`` of the model minus the rival, a key of ``RIVALS``.
     """
     masks = {
         "seen": "over pixels seen before",
@@ -149,11 +140,7 @@ def _outcome(entry: Mapping[str, Any]) -> str:
 
 
 def format_drift(drift: Mapping[str, Any]) -> str:
-    """Return a sentence on the drift of the model's long rollouts.
-
-    Args:
-        drift: ``statistics.drift`` of the model's own row.
-    """
+    """Return a sentence on ``statistics.drift`` of the model's own long rollouts."""
     if drift["difference"] is None:
         return "Long rollouts have fewer than 32 frames: their drift is not measured."
     first, last, change = (drift[name] for name in ("first16", "last16", "difference"))
@@ -259,11 +246,7 @@ def format_map_growth(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Return the report's sentences for the terminal: baselines first, then the map.
-
-    Args:
-        metrics: the content of ``metrics.json``.
-    """
+    """Return the report's sentences for the terminal: baselines first, then the map."""
     margins, own = metrics["margins"], own_method(metrics["results"])
     lines = [NO_MEMORY]
     if own == "memory":

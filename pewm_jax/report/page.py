@@ -112,10 +112,7 @@ class Section:
 def render(title: str, opening: Sequence[Block], sections: Sequence[Section | None]) -> str:
     """Return a page as HTML.
 
-    Args:
-        title: its title; a line break starts a new line.
-        opening: the blocks before the first section.
-        sections: the sections; None is skipped.
+    A line break in the title starts a new line. A section that is None is skipped.
     """
     return _template().render(
         title=title.replace("\n", ", "),

@@ -80,7 +80,7 @@ def grid(
     cell: int = 128,
     gap: int = 6,
 ) -> np.ndarray:
-    """Arrange images in a captioned grid.
+    """Arrange images in a captioned grid, one uint8 image with even sides.
 
     Args:
         rows: caption and images (uint8, all of one shape) of each row.
@@ -88,9 +88,6 @@ def grid(
         title: a line above the grid.
         cell: width of an image, pixels.
         gap: space between images, pixels.
-
-    Returns:
-        One uint8 image with even sides.
     """
     tall = round(rows[0][1][0].shape[0] * cell / rows[0][1][0].shape[1])
     left = 16 + max(int(font(15).getlength(caption)) for caption, _ in rows) + 10

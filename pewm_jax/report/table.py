@@ -100,10 +100,8 @@ CellLike: TypeAlias = Cell | str
 class Row:
     """A row of a table.
 
-    Attributes:
-        cells: its cells; a heading has only its text.
-        kind: ``heading`` spans all columns, ``highlight`` is tinted.
-        rule: whether LaTeX draws a rule above it.
+    A ``heading`` has one cell, which spans all columns; a ``highlight`` is tinted. LaTeX draws a
+    ``rule`` above it.
     """
 
     cells: tuple[Cell, ...]

@@ -156,8 +156,7 @@ def _require_fit(
     if frames < own.frames:
         raise UserError(
             f"walks of {study.practice.blocks} blocks have {frames} frames, but {policy} is "
-            "trained "
-            f"on clips of {own.frames}: use more --blocks."
+            f"trained on clips of {own.frames}: use more --blocks."
         )
 
 
@@ -182,12 +181,7 @@ def power(practised_C: np.ndarray, chance_C: np.ndarray, houses_C: np.ndarray) -
 
     Practice in the real house is an upper bound for practice in any world. If it does not beat
     random walks, the task cannot distinguish worlds. The p value is one-sided, from the bootstrap
-    over houses; None for fewer than two houses.
-
-    Args:
-        practised_C: score of each goal after practice in the house itself; higher is better.
-        chance_C: score of each goal with random walks.
-        houses_C: index of each goal's house.
+    over houses of each goal's scores (higher is better); None for fewer than two houses.
     """
     gain_C = practised_C - chance_C
     p_value = intervals.p_over_houses(gain_C, houses_C)
@@ -323,8 +317,7 @@ def _power(results: Mapping[str, Any]) -> str:
         return f"{words} Below {test['level']:g}: the task can distinguish worlds."
     return (
         f"**{words} Not below {test['level']:g}: the task has no power, because even practice in "
-        "the "
-        "house itself does not beat chance. No comparison between worlds is drawn from it.**"
+        "the house itself does not beat chance. No comparison between worlds is drawn from it.**"
     )
 
 

@@ -56,9 +56,7 @@ class PracticeConfig:
         actions: number of actions of the walk to a goal.
         most: largest number of actions of the policy per goal.
         replan: number of actions taken from a proposal before the next.
-        practice: settings of practice.
         steps: number of training steps on its walks.
-        learning_rate: learning rate of that training.
         seeds: seeds of practice and training.
         shown: number of houses whose first walks are in the image.
     """
@@ -102,14 +100,7 @@ def make(
 ) -> dict[str, Any]:
     """Return the scores of one policy in one house, and statistics of its practice.
 
-    Args:
-        world: the world that imagines the house.
-        begun: the policy before practice.
-        home: the house, and its observations.
-        study: the settings.
-        how: one of ``ROWS``.
-        seed: seed of practice and training.
-        folder: folder of its walks and its training.
+    ``how`` is one of ``ROWS``; the folder is that of its walks and its training.
 
     Raises:
         UserError: a loss is not finite, or the folder contains walks with other settings.

@@ -143,9 +143,8 @@ def _steps(order: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def adjust(family: Sequence[Mapping[str, dict[str, Any]]]) -> None:
     """Add Holm's adjusted p values to the differences of one table of the page, column by column.
 
-    Args:
-        family: for each row of the table, its differences by measure; ``p_holm`` and
-            ``p_seeds_holm`` are added to each that has ``p`` and ``p_seeds``.
+    Each row has its differences by measure; ``p_holm`` and ``p_seeds_holm`` are added to each that
+    has ``p`` and ``p_seeds``.
     """
     for measure in {name for found in family for name in found}:
         column = [found[measure] for found in family if measure in found]

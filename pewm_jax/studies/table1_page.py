@@ -76,12 +76,11 @@ RIVALS = ("none", "none-attend", "voxel-attend", "reproject")
 NOT_COMPARABLE = (
     "The paper's numbers are for 512 × 512 images of scanned houses, a model of about 3 billion "
     "parameters (our estimate) trained on 8 GPUs for days, DINOv2 features, and an FVD and an "
-    "LPIPS "
-    "whose networks and numbers of clips are not specified; ours are for small images and a small "
-    "model (above). Only the order of the rows, and the signs of differences, can be compared. "
-    "LPIPS and SRC use AlexNet here; the paper's SRC uses DINOv2, over consecutive imagined clips "
-    "with the map growing between them, and ours a way out and back within one clip: it does not "
-    "measure memory."
+    "LPIPS whose networks and numbers of clips are not specified; ours are for small images and a "
+    "small model (above). Only the order of the rows, and the signs of differences, can be "
+    "compared. LPIPS and SRC use AlexNet here; the paper's SRC uses DINOv2, over consecutive "
+    "imagined clips with the map growing between them, and ours a way out and back within one "
+    "clip: it does not measure memory."
 )
 
 
@@ -176,12 +175,7 @@ def place_floor(results: Mapping[str, Any], measure: str) -> float | None:
 
 
 def scores_table(results: Mapping[str, Any], *, arrows: bool = False) -> Table:
-    """Return the table of scores.
-
-    Args:
-        results: the content of ``results.json``.
-        arrows: whether headings have an arrow for the better direction.
-    """
+    """Return the table of scores, with an arrow for the better direction in headings if asked."""
     names, columns = rows_of(results), columns_of(results)
     best = {measure: best_of(results, names, measure) for measure in columns}
     lines: list[Row] = []
@@ -305,15 +299,13 @@ def how(results: Mapping[str, Any]) -> str:
         but = "".join(f", {time:g} times as long for rows that say so" for time in times)
         equal = f"equal time ({first:g} + {second:g} {clock}minutes of training steps{but})"
     return (
-        f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; "
-        f"images of {size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} "
-        f"imagined frames in {about['houses']} {about['house']}s, {about['context']} "
-        f"frames of context. Means over {about['house']}s; ± is half of "
-        f"the 95 % interval over {about['house']}s (bootstrap), for FVD and KVD over training "
-        "seeds "
-        f"(Student's). Protocol {about['protocol_sha256'][:12]}. Total wall-clock time "
-        f"{about['hours']['clock']:.1f} hours, processor time {about['hours']['cpu']:.1f} "
-        f"hours; {about['date']}."
+        f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; images of "
+        f"{size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} imagined frames "
+        f"in {about['houses']} {about['house']}s, {about['context']} frames of context. Means over "
+        f"{about['house']}s; ± is half of the 95 % interval over {about['house']}s (bootstrap), "
+        "for FVD and KVD over training seeds (Student's). Protocol "
+        f"{about['protocol_sha256'][:12]}. Total wall-clock time {about['hours']['clock']:.1f} "
+        f"hours, processor time {about['hours']['cpu']:.1f} hours; {about['date']}."
     )
 
 
@@ -393,11 +385,10 @@ def _order_text(results: Mapping[str, Any]) -> str:
     text = _markdown(["step of the paper's order", *STEP_HEADINGS], rows)
     return (
         "## The paper's order\n\nThe paper has no memory < image memory < no depth < 2D map < 3D "
-        "map. Each step here, paired. *None · attend* is our control: a "
-        "reader without input, trained equally long. All readers use projective positions, except "
-        "the last step, which uses the paper's sinusoid. The effect of a memory is the difference "
-        "of seen minus unseen pixels: an improvement of both is not due to memory.\n\n"
-        f"{PAIRED}\n\n{text}"
+        "map. Each step here, paired. *None · attend* is our control: a reader without input, "
+        "trained equally long. All readers use projective positions, except the last step, which "
+        "uses the paper's sinusoid. The effect of a memory is the difference of seen minus unseen "
+        f"pixels: an improvement of both is not due to memory.\n\n{PAIRED}\n\n{text}"
     )
 
 

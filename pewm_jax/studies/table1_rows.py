@@ -79,11 +79,7 @@ class Row:
 
 
 def main_rows(base: Config) -> tuple[Row, ...]:
-    """Return the rows of the table.
-
-    Args:
-        base: the settings that all rows share; its memory is the paper's.
-    """
+    """Return the rows of the table; the memory of the settings that all share is the paper's."""
     memory, attend = base.model.memory, _attend(base)
     sinusoid = dataclasses.replace(attend, positions="sinusoid", frame="world")
     voxel = _as(memory, VoxelConfig, attend)
@@ -234,13 +230,7 @@ def _features(base: Config, kind: str) -> Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Ablation:
-    """An ablation of a setting of the paper's map.
-
-    Attributes:
-        make: returns the memory with a value of the setting.
-        values: the default values.
-        about: description of the setting, with its unit.
-    """
+    """An ablation of a setting of the paper's map; ``about`` describes it, with its unit."""
 
     make: Callable[[Config, str], Memory]
     values: tuple[str, ...]
@@ -260,11 +250,6 @@ ABLATIONS: Mapping[str, Ablation] = {
 
 def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row, ...]:
     """Return the rows of an ablation; a row that is also in the table has the same name.
-
-    Args:
-        base: the settings that all rows share.
-        name: name of the ablation.
-        values: values to try; by default the ablation's own.
 
     Raises:
         UserError: there is no such ablation, or a value cannot be used.

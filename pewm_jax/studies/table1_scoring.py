@@ -59,12 +59,9 @@ class Scorer:
 
     Attributes:
         config: the settings that all rows share, with those of the protocol.
-        protocol: the scored clips.
-        batches: the clips.
         nets: the available metrics that need weights.
         left_out: name of a metric → reason why it is skipped.
         name: a hash of all that scores depend on besides the weights.
-        log: prints a line.
     """
 
     config: Config
@@ -94,11 +91,7 @@ class Scorer:
         return self.config.model.clip.frames
 
     def row(self, config: Config, *, memory: bool) -> Arrays:
-        """Score a trained row, or return its stored scores.
-
-        Args:
-            config: configuration of its training.
-            memory: whether to use its memory or an empty one.
+        """Score a trained row with its memory or an empty one, or return its stored scores.
 
         Raises:
             UserError: its weights are missing or damaged, or an imagined value is not finite.
@@ -219,11 +212,8 @@ def open_scorer(
 ) -> Scorer:
     """Fix the protocol before training, and read its clips.
 
-    Args:
-        config: the settings that all rows share.
-        out: the folder of the table; its ``protocol.json`` is written or, if it exists, used.
-        log: prints a line.
-        weights: metric → its file or folder of weights, for those that ship with no package.
+    The ``protocol.json`` of the table's folder is written or, if it exists, used. ``weights`` are
+    by metric its file or folder, for those that ship with no package.
 
     Raises:
         UserError: the data are missing or have changed, or the folder contains another protocol.
@@ -311,12 +301,8 @@ they are omitted from the name."""
 def recorded_path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: str) -> Path:
     """Return the file of a row's scores.
 
-    Args:
-        study: settings shared by all rows.
-        row: the row.
-        seed: training seed.
-        steps: name of a row or backbone → number of steps.
-        scored: hash of the protocol and the metrics (``Scorer.name``).
+    ``steps`` are by name of a row or backbone, ``scored`` is the hash of the protocol and the
+    metrics (``Scorer.name``).
     """
     start = study.base.train.start
     facts: list[Any] = [

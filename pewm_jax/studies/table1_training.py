@@ -52,8 +52,6 @@ class Study:
     """Settings shared by all trainings of a table.
 
     Attributes:
-        base: the settings, including the data folder.
-        out: the output folder.
         minutes: processor minutes of training steps: a backbone's, and a row's.
         steps: numbers of steps instead of minutes, for both; None for equal time.
     """
@@ -80,12 +78,7 @@ class Study:
 
 
 def backbone_of(base: Config, row: Row) -> Row:
-    """Return the backbone that a row starts from, as a row: without a memory, with its depth.
-
-    Args:
-        base: the settings that all rows share; rows of equal depth have the same backbone.
-        row: the row.
-    """
+    """Return the backbone that a row starts from, as a row: without a memory, with its depth."""
     given = {
         field.name: getattr(base.model.memory, field.name)
         for field in dataclasses.fields(NoMemoryConfig)
@@ -95,17 +88,10 @@ def backbone_of(base: Config, row: Row) -> Row:
 
 
 def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Config:
-    """Return the settings of one training.
+    """Return the settings of one training of a row, or of its backbone, from the weights ``start``.
 
     A continued backbone gets the clips that the readers of this seed get, not those of its backbone
     again: clips are selected by the seed and the stage's number.
-
-    Args:
-        study: shared settings.
-        row: the row, or its backbone.
-        seed: training seed.
-        steps: number of steps of the only trained stage.
-        start: the weights to start from.
     """
     base = study.base
     clip = dataclasses.replace(base.model.clip, depth=row.depth)
@@ -129,17 +115,9 @@ def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Co
 
 
 def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], log: Log) -> Config:
-    """Train a row and its backbone, unless they are trained already.
+    """Train a row and its backbone, unless they are trained already; return the row's settings.
 
-    Args:
-        study: shared settings.
-        row: the row.
-        seed: training seed.
-        steps: from ``planned``: name of a row or backbone → number of steps.
-        log: prints a line.
-
-    Returns:
-        The settings of the row's training, whose folder is ``train.run``.
+    ``steps`` are those of ``planned``, by name of a row or backbone. The folder is ``train.run``.
 
     Raises:
         UserError: the data do not fit, or a loss is not finite.
@@ -194,8 +172,7 @@ def _require_same(config: Config) -> None:
         what = " and ".join(name for name in now if now[name] != before.get(name))
         raise UserError(
             f"{run} was made from other weights or data ({what}) than the present ones: delete it, "
-            "or "
-            "choose another folder by --out."
+            "or choose another folder by --out."
         )
 
 
@@ -228,12 +205,10 @@ Times = dict[str, float]
 
 
 def planned(study: Study, rows: Sequence[Row], log: Log) -> dict[str, Any]:
-    """Return the number of steps of each row and its backbone; measured once.
+    """Return the time and the number of steps of each row and its backbone.
 
-    Trainings timed later are timed together with one that was timed before, and scaled by it.
-
-    Returns:
-        By name: ``seconds`` per step, None for equal steps; and ``steps``.
+    ``seconds`` per step are None for equal steps. Trainings timed later are timed together with one
+    that was timed before, and scaled by it.
 
     Raises:
         UserError: ``plan.json`` is damaged.
@@ -280,8 +255,7 @@ def _read_times(path: Path) -> Times:
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} is damaged ({error}), but it defines the lengths of trainings: restore it, or "
-            "use "
-            "another folder by --out."
+            "use another folder by --out."
         ) from None
 
 

@@ -41,12 +41,9 @@ class Table2Config:
     """The settings of a table.
 
     Attributes:
-        tasks: number of tasks.
         houses: number of held-out houses, which tasks use in turn.
         proposals: numbers of a policy's proposals that are ranked.
         plan: settings of the planner.
-        policy: name of the policy.
-        cost: name of the cost.
         videos: number of tasks shown as videos.
         multiples: distances of goals, in multiples of ``plan.actions`` actions.
         none: a run that was trained without memory, or "".

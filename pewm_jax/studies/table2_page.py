@@ -72,12 +72,7 @@ def label(name: str) -> str:
 
 
 def scores_table(results: Mapping[str, Any], *, seconds: bool = False) -> Table:
-    """Return the scores of one distance.
-
-    Args:
-        results: ``rows`` of the content of ``results.json``.
-        seconds: whether to include a column with the time per decision.
-    """
+    """Return the scores of one distance, with the time per decision if asked."""
     header = ["method", *(heading for heading, _ in COLUMNS.values())]
     rows = [
         [
@@ -150,11 +145,9 @@ def _how(results: Mapping[str, Any]) -> str:
         "loop: one plan, executed completely. Closed loop: after each clip's actions the agent "
         "observes the real frames and plans the remaining actions again; at the end it may execute "
         "one more clip if that lowers the predicted cost. ATE and RPE against that walk, "
-        "unaligned; "
-        "SIM = 50 (max(0, 1 − remaining distance "
-        "/ distance) + 1 − heading error / π); success within "
-        f"{about['within_m']:g} m and {about['within_deg']:g}°. Means over houses; ± is half of "
-        f"the 95 % interval (bootstrap over houses). {about['date']}."
+        "unaligned; SIM = 50 (max(0, 1 − remaining distance / distance) + 1 − heading error / π); "
+        f"success within {about['within_m']:g} m and {about['within_deg']:g}°. Means over houses; "
+        f"± is half of the 95 % interval (bootstrap over houses). {about['date']}."
     )
 
 

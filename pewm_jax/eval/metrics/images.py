@@ -61,13 +61,9 @@ def _band(length: int) -> np.ndarray:
 def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
     """Return structural similarity per pixel (Wang et al. 2004, Eq. 13; K1 = .01, K2 = .03).
 
-    Args:
-        a_HWC: (..., H, W, 3) colours in [0, 1], H and W at least 11.
-        b_HWC: the same shape.
-
-    Returns:
-        (..., H − 10, W − 10), averaged over colours: only pixels whose whole 11 × 11 Gaussian
-        window lies in the image have a value, as in the original. Its mean is the usual SSIM.
+    Both are (..., H, W, 3) colours in [0, 1], H and W at least 11. The result, (..., H − 10, W −
+    10), is averaged over colours: only pixels whose whole 11 × 11 Gaussian window lies in the image
+    have a value, as in the original. Its mean is the usual SSIM.
     """
     height, width = a_HWC.shape[-3:-1]
     rows, columns = jnp.asarray(_band(height)), jnp.asarray(_band(width))
@@ -88,18 +84,11 @@ def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
 
 
 def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Array) -> Array:
-    """Sum the errors of imagined frames under each mask.
+    """Sum the errors of T imagined frames under each mask of pixels seen before or never seen.
 
-    Args:
-        predicted: T imagined frames.
-        true: T recorded frames of the same size.
-        seen_THW: (T, H, W) bool, pixels whose surface was seen before.
-        unseen_THW: (T, H, W) bool, pixels whose surface was never seen.
-
-    Returns:
-        (T, 3, 9): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
-        pixels whose window lies inside the image. Depth counts pixels with both a true and a
-        predicted depth (a copied frame may have holes).
+    Returns (T, 3, 9): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
+    pixels whose window lies inside the image. Depth counts pixels with both a true and a predicted
+    depth (a copied frame may have holes).
     """
     guess, truth = unit_colours(predicted.rgb_THWC), unit_colours(true.rgb_THWC)
     squared_THW = ((guess - truth) ** 2).sum(-1)
@@ -131,12 +120,7 @@ error_sums_batch = jax.jit(jax.vmap(error_sums))
 
 
 def with_lpips(sums: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Return sums with LPIPS, which is defined for whole images: only under the mask ``all``.
-
-    Args:
-        sums: (..., T, 3, 9) from ``error_sums``.
-        distances: (..., T) LPIPS of every frame.
-    """
+    """Return sums (..., T, 3, 9) with LPIPS (..., T), of whole images: only under ``all``."""
     sums = np.array(sums)
     sums[..., MASKS.index("all"), SUMS.index("lpips")] = distances
     sums[..., MASKS.index("all"), SUMS.index("pictures")] = 1
@@ -162,11 +146,8 @@ class Metric(Protocol):
 def name_with_hash(network: str, params: Params, published: str) -> str:
     """Return a network's name, with 8 digits of the hash of weights that are not published.
 
-    Args:
-        network: its name.
-        params: its weights.
-        published: ``tree.digest`` of the published weights, which is independent of the file
-            format.
+    ``published`` is ``tree.digest`` of the published weights, which is independent of the file
+    format.
     """
     digest = tree.digest(params)
     return network if digest == published else f"{network}-{digest[:8]}"
@@ -229,11 +210,8 @@ PLAIN: dict[str, Metric] = {"psnr": clip_psnr, "ssim": clip_ssim}
 def clip_depth_mae(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
     """Return the mean absolute error, m, (B,), where both have a depth; NaN if none has.
 
-    A clip with an imagined depth that is not finite has no score: NaN.
-
-    Args:
-        imagined_BTHW: (B, T, H, W) or (B, T, H, W, 1) depths along the optical axis, m; 0 for none.
-        truth_BTHW: the same shape.
+    Both are (B, T, H, W) or (B, T, H, W, 1) depths along the optical axis, m; 0 for none. A clip
+    with an imagined depth that is not finite has no score: NaN.
 
     Raises:
         UserError: the clips differ in shape, or are not floats.

@@ -34,12 +34,8 @@ PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
 class LPIPS:
     """LPIPS with its weights; a ``Metric``.
 
-    Attributes:
-        net: the network.
-        params: its parameters.
-        sha256: hash of the weights file.
-        encoder: the network's name, with a hash for weights other than the package's
-            (``alex-1a2b3c4d``).
+    ``sha256`` is the hash of the weights file; ``encoder`` the network's name, with a hash for
+    weights other than the package's (``alex-1a2b3c4d``).
     """
 
     net: Net
@@ -64,11 +60,7 @@ class LPIPS:
     def towards(self, truth_BTHWC: Array) -> Callable[[Array], Array]:
         """Return ``frames`` with a fixed ground truth, which passes through the network only once.
 
-        Args:
-            truth_BTHWC: as for ``Metric``.
-
-        Returns:
-            ``imagined_BTHWC -> distances (B, T)``, which raises the same errors as ``frames``.
+        ``imagined_BTHWC -> distances (B, T)`` raises the same errors as ``frames``.
         """
         made = jax.eval_shape(self.described, truth_BTHWC)
         if sum(x.size * x.dtype.itemsize for x in made) > KEPT:
@@ -142,11 +134,7 @@ def _batch_size(pictures_NHWC: Array) -> int:
 
 
 def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
-    """Read LPIPS from a file of weights.
-
-    Args:
-        path: the file.
-        net: the required network; by default the file's.
+    """Read LPIPS from a file of weights; ``net`` is the required network, by default the file's.
 
     Raises:
         UserError: see ``models.lpips.convert.read``.
@@ -159,15 +147,11 @@ def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
 
 
 def select_lpips(setting: str, height: int, width: int) -> tuple[LPIPS | None, str]:
-    """Return the LPIPS that a setting selects, and a description or the reason for None.
-
-    Args:
-        setting: ``evaluate.lpips``.
-        height: height of the scored images, pixels.
-        width: width of the scored images, pixels.
+    """Return the LPIPS that ``evaluate.lpips`` selects, and a description or the reason for None.
 
     Raises:
-        UserError: explicitly requested weights are missing, damaged, or unsuitable for such images.
+        UserError: explicitly requested weights are missing, damaged, or unsuitable for images of
+            ``height`` × ``width`` pixels.
     """
     if setting == OFF:
         return None, "LPIPS is not measured (evaluate.lpips)."
@@ -197,12 +181,7 @@ PICTURES = 8
 
 @dataclasses.dataclass(frozen=True)
 class DreamSim:
-    """DreamSim's distance, averaged over a clip's frames; a ``Metric``, lower is better.
-
-    Attributes:
-        params: parameters of the three encoders.
-        sha256: hash of them.
-    """
+    """DreamSim's distance, averaged over a clip's frames; a ``Metric``, lower is better."""
 
     params: Params = dataclasses.field(repr=False)
     sha256: str = ""

@@ -38,10 +38,6 @@ def frechet(a_NF: np.ndarray, b_MF: np.ndarray) -> float:
     last trace is the sum of the singular values of Ra Rbᵀ: no matrix root is needed, and sets with
     fewer than F vectors need no special case.
 
-    Args:
-        a_NF: N ≥ 2 vectors.
-        b_MF: M ≥ 2 vectors.
-
     Raises:
         UserError: the sets are too small, of different widths, or not finite.
     """
@@ -60,10 +56,6 @@ def kernel(a_NF: np.ndarray, b_NF: np.ndarray) -> float:
     vector with itself and with its partner of the same index (Gretton et al. 2012, Eq. 4), so it is
     unbiased even if partners are dependent, as an imagined clip and its ground truth are. It may be
     negative.
-
-    Args:
-        a_NF: N ≥ 2 vectors.
-        b_NF: M = N vectors.
 
     Raises:
         UserError: the sets are too small, of different sizes or widths, or not finite.
@@ -100,18 +92,7 @@ def distance_floor(
     splits: int = SPLITS,
     seed: int = 0,
 ) -> Spread:
-    """Return a distance between two disjoint sets of n true clips, averaged over random draws.
-
-    Args:
-        distance: ``frechet`` or ``kernel``.
-        truth_NF: features of true clips.
-        n: vectors in each set; by default half of them.
-        splits: number of random draws.
-        seed: seed of the draws.
-
-    Raises:
-        UserError: there are fewer than 2 n vectors, or n is below 2.
-    """
+    """Return ``distance_of_halves`` of true clips: a distance between two disjoint sets of them."""
     return distance_of_halves(distance, truth_NF, truth_NF, n, splits=splits, seed=seed)
 
 
@@ -126,19 +107,11 @@ def distance_of_halves(
 ) -> Spread:
     """Return a distance of n imagined clips from the ground truth of n others.
 
-    With equal arguments the same clips are drawn as in ``distance_floor``, so that the two can be
-    compared.
-
-    Args:
-        distance: ``frechet`` or ``kernel``.
-        imagined_NF: features of imagined clips.
-        truth_NF: features of their ground truth, in the same order.
-        n: vectors in each set; by default half of them.
-        splits: number of random draws.
-        seed: seed of the draws.
+    It is averaged over ``splits`` random draws; n is by default half of the clips. With equal
+    arguments the same clips are drawn as in ``distance_floor``, so that the two can be compared.
 
     Raises:
-        UserError: see ``distance_floor``.
+        UserError: there are fewer than 2 n vectors, n is below 2, or the two are not pairs.
     """
     count = len(truth_NF)
     n = count // 2 if n is None else n
@@ -147,8 +120,7 @@ def distance_of_halves(
     if n < 2 or 2 * n > count:
         raise UserError(
             f"two sets of {n} clips cannot be drawn from {count}: each needs at least 2 clips, and "
-            "none "
-            "in common."
+            "none in common."
         )
     rng, found = np.random.default_rng(seed), []
     for _ in range(splits):
@@ -164,11 +136,7 @@ def _root(x_NF: np.ndarray) -> np.ndarray:
 
 
 def _sets(a_NF: np.ndarray, b_MF: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both sets in float64.
-
-    Raises:
-        UserError: the sets cannot be compared.
-    """
+    """Return both sets in float64, or raise a ``UserError`` if they cannot be compared."""
     a, b = (np.asarray(x, np.float64) for x in (a_NF, b_MF))
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
         raise UserError(
@@ -197,7 +165,6 @@ class SetScore:
 
     Attributes:
         value: between all imagined clips and all true ones.
-        clips: number of clips of each.
         half: between half of the imagined clips and the ground truth of the others, over random
             halves; None with fewer than 4 clips.
         floor: between the ground truth of the two halves, over the same halves.
@@ -219,11 +186,8 @@ class SetScore:
 class VideoDistance:
     """FVD or KVD with the weights of I3D.
 
-    Attributes:
-        kind: which of them.
-        params: parameters of I3D.
-        sha256: hash of the weights file.
-        encoder: the network's name, with a hash for weights other than the package's.
+    ``sha256`` is the hash of the weights file; ``encoder`` the network's name, with a hash for
+    weights other than the package's.
     """
 
     kind: Kind
@@ -234,9 +198,7 @@ class VideoDistance:
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> np.ndarray:
         """Return one value for the whole set, () float64; lower is better, 0 for equal sets.
 
-        Args:
-            imagined_BTHWC: (B, T, H, W, 3) floats in [−1, 1], or uint8; B ≥ 2, T ≥ 9.
-            truth_BTHWC: the same shape.
+        Both are (B, T, H, W, 3) floats in [−1, 1], or uint8; B ≥ 2, T ≥ 9.
 
         Raises:
             UserError: the clips differ in shape, or are too few or too short.
@@ -254,9 +216,6 @@ class VideoDistance:
     def features(self, video_BTHWC: Array) -> np.ndarray:
         """Return the features of clips, (B, 400); those of several batches can be joined.
 
-        Args:
-            video_BTHWC: (B, T, H, W, 3) floats in [−1, 1], or uint8; T ≥ 9.
-
         Raises:
             UserError: the clips are too short, or not colours.
         """
@@ -264,12 +223,9 @@ class VideoDistance:
         return np.asarray(_features(self.params, colours(video_BTHWC, video_BTHWC)[0]))
 
     def score(self, imagined_NF: np.ndarray, truth_NF: np.ndarray, seed: int = 0) -> SetScore:
-        """Return the distance between sets of features, and of the ground truth from itself.
+        """Return the distance between the features of all imagined clips and of their ground truth.
 
-        Args:
-            imagined_NF: ``features`` of all imagined clips.
-            truth_NF: those of their ground truth, in the same order.
-            seed: seed of the random halves.
+        ``seed`` is that of the random halves.
 
         Raises:
             UserError: the sets are too small, of different shapes, or not finite.
