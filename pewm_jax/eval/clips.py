@@ -157,7 +157,10 @@ def load_clip(
             recorded poses, or the frames have another size than the model's.
     """
     episode = episodes[choice.episode]
-    context = _without_padding(episode.frames(list(choice.context_S)), choice.context_S)
+    context = episode.frames(list(choice.context_S))
+    repeated = np.append(np.diff(choice.context_S) == 0, False)  # all but the last copy
+    depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
+    context = dataclasses.replace(context, depth_THW=depth)
     targets = episode.frames(list(choice.targets_N))
     size = (config.model.clip.height, config.model.clip.width)
     if targets.rgb_THWC.shape[1:3] != size:
@@ -180,13 +183,6 @@ def load_clip(
         taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
         _check_motion(taken, poses, choice, "recorded actions")
     return context, targets, actions_N3
-
-
-def _without_padding(context: Frames, context_S: Sequence[int]) -> Frames:
-    """Set the depth of repeated context frames to 0 in all but the last copy."""
-    repeated = np.append(np.diff(context_S) == 0, False)
-    depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
-    return dataclasses.replace(context, depth_THW=depth)
 
 
 _integrate = jax.jit(integrate)

@@ -31,6 +31,14 @@ from pewm_jax.worlds.rollouts import load_finished
 
 FRAMES = 16
 """Number of frames scored per episode, evenly spaced."""
+LABELS = {
+    "psnr": "colour, PSNR, dB",
+    "depth_cm": "depth error, cm",
+    "depth_relative": "depth error, relative",
+    "square_rgb": "latents of colour, mean square",
+    "square_depth": "latents of depth, mean square",
+}
+"""The scores, as they are printed."""
 
 
 def score(
@@ -94,8 +102,10 @@ def score(
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     log(f"{folder}: {len(scenes)} scenes, {', '.join(sizes)} pixels")
-    for line in _lines(numbers):
-        log(line)
+    for name, about in LABELS.items():
+        mean, error = numbers[name]["mean"], numbers[name]["error"]
+        text = "nothing measured" if mean is None else f"{mean:.3f}"
+        log(f"  {about:<30} {text}" + (f" ± {error:.3f}" if error is not None else ""))
     return path
 
 
@@ -145,19 +155,3 @@ def _mean_over_scenes(scenes: list[list[float]]) -> dict[str, float | None]:
         "mean": float(means.mean()) if len(means) else None,
         "error": float(means.std(ddof=1) / np.sqrt(len(means))) if many else None,
     }
-
-
-def _lines(numbers: Mapping[str, Mapping[str, float | None]]) -> list[str]:
-    units = {
-        "psnr": "colour, PSNR, dB",
-        "depth_cm": "depth error, cm",
-        "depth_relative": "depth error, relative",
-        "square_rgb": "latents of colour, mean square",
-        "square_depth": "latents of depth, mean square",
-    }
-    lines = []
-    for name, about in units.items():
-        mean, error = numbers[name]["mean"], numbers[name]["error"]
-        text = "nothing measured" if mean is None else f"{mean:.3f}"
-        lines.append(f"  {about:<30} {text}" + (f" ± {error:.3f}" if error is not None else ""))
-    return lines

@@ -48,31 +48,21 @@ class LoadedRun:
         }
 
 
-def folders(run: str | Path) -> tuple[Path, Path]:
-    """Return the folder of a run and the folder for its reports.
-
-    For a model that ships with the library, its files are in the package, which is not written to,
-    and its reports go to ``runs/NAME``.
-
-    Raises:
-        UserError: there is no such folder.
-    """
-    folder = shipped.find(run)
-    if not folder.is_dir():
-        raise UserError(f"{run} does not exist; train a model first, e.g. `pewm-jax train demo`.")
-    return folder, shipped.home(run)
-
-
 def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
     """Load a run of a world model, by its folder or the name of a model that ships.
+
+    The files of a model that ships are in the package, which is not written to; its reports go to
+    ``runs/NAME``.
 
     Raises:
         UserError: it is missing, damaged, or of a world without reports.
     """
-    folder, home = folders(run)
+    folder = shipped.find(run)
+    if not folder.is_dir():
+        raise UserError(f"{run} does not exist; train a model first, e.g. `pewm-jax train demo`.")
     config, params = load_finished(folder, config=config)
     require_world(config.model, f"evaluating {run}")
-    return LoadedRun(folder, home, config, params, file_hash(folder / WEIGHTS))
+    return LoadedRun(folder, shipped.home(run), config, params, file_hash(folder / WEIGHTS))
 
 
 def has_memory(loaded: LoadedRun) -> bool:

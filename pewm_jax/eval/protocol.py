@@ -225,8 +225,7 @@ def resolve_clips(
 ) -> tuple[Protocol, list[ClipChoice], list[ClipChoice]]:
     """Return the protocol, its clips and its long rollouts: fixed, or chosen by the settings.
 
-    Raises:
-        UserError: as ``find_clips``, ``choose_clips`` and ``make_protocol``.
+    Errors are those of ``find_clips``, ``choose_clips`` and ``make_protocol``.
     """
     if fixed is not None:
         return fixed, *find_clips(fixed, episodes, where)

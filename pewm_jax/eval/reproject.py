@@ -27,7 +27,6 @@ from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.depth_images import normals
 from pewm_jax.io.store import ResultCache, file_hash, inputs_hash
 from pewm_jax.memory import rendering
-from pewm_jax.memory import rendering as views
 from pewm_jax.types import Array, Camera, Clip, Frames, View
 
 
@@ -84,7 +83,7 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
     Colours are float32 in [−1, 1]. Pixels without depth, such as those of padding frames, are
     ignored. An image without any observed point is black and has no depth.
     """
-    view = views.fill_nearest(draw(settings, context, camera))
+    view = rendering.fill_nearest(draw(settings, context, camera))
     return Frames(2 * view.features_THWF - 1, view.depth_THW, camera)
 
 
@@ -97,20 +96,10 @@ def draw(settings: ReprojectSettings, context: Frames, camera: Camera) -> View:
     there = (depth_SHW > 0).reshape(-1)
     if settings.average or settings.footprint > 1 or not settings.backs:
         focal = jnp.asarray(context.camera.intrinsics_4)[:, 0, None, None]
-        return rendering.splat_surfels(
-            points,
-            colours,
-            settings.width * (depth_SHW / focal).reshape(-1),
-            there,
-            camera,
-            height,
-            width,
-            most=settings.footprint,
-            average=settings.average,
-            normals_V3=None
-            if settings.backs
-            else normals(depth_SHW, context.camera).reshape(-1, 3),
-        )
+        sizes = settings.width * (depth_SHW / focal).reshape(-1)
+        facing = None if settings.backs else normals(depth_SHW, context.camera).reshape(-1, 3)
+        how = {"most": settings.footprint, "average": settings.average, "normals_V3": facing}
+        return rendering.splat_surfels(points, colours, sizes, there, camera, height, width, **how)
     return rendering.splat(points, colours, there, camera, height, width)
 
 

@@ -264,11 +264,6 @@ class Methods:
         left_out |= {"none"} if self.none is None else set()
         return tuple(name for name in METHODS if name not in left_out)
 
-    @property
-    def own(self) -> str:
-        """Return the method of the model itself: ``memory``, or ``model`` if it has none."""
-        return "memory" if self.remembers else "model"
-
     def piece(self, method: str) -> str:
         """Return the method's name in partial results, which includes what its scores depend on."""
         extra = {"none": self.none_weights[:16], "reproject": self.reproject.name}

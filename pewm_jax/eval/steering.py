@@ -24,7 +24,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval import intervals
+from pewm_jax.eval import statistics
 from pewm_jax.eval.clips import ClipChoice, choice_of, load_clip, return_start, stack
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.runner import workers
@@ -224,13 +224,8 @@ class Steered:
         }
 
     def _entries(self, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-        each = {name: intervals.entry(found, self.walks.houses) for name, found in values.items()}
-        more = {
-            f"{TRUE} - {name}": intervals.entry(values[TRUE] - found, self.walks.houses)
-            for name, found in values.items()
-            if name != TRUE
-        }
-        return {**each, **more}
+        gains = {f"{TRUE} - {n}": values[TRUE] - x for n, x in values.items() if n != TRUE}
+        return statistics.entries({**values, **gains}, self.walks.houses)
 
     def lines(self) -> list[str]:
         """Return the table as text."""

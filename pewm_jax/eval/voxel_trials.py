@@ -131,9 +131,6 @@ def run(
         batch: number of walks imagined at once.
         chunk: number of frames imagined per call.
         count: number of trials after which to stop; None for all walks.
-
-    Raises:
-        UserError: see ``block_class``.
     """
     model: PERSIST = config.model
     number = block_class(config, walks, name)

@@ -219,6 +219,15 @@ def with_half_width(entry: Mapping[str, Any] | None, digits: int, *, sign: bool 
     return Cell(entry["mean"], digits, error=half, sign=sign)
 
 
+def score_cells(
+    columns: Mapping[str, tuple[str, int]], entries: Mapping[str, Any], *, sign: bool = False
+) -> list[Cell]:
+    """Return the cells of scores with half of their interval; a column is a heading and digits."""
+    return [
+        with_half_width(entries[score], digits, sign=sign) for score, (_, digits) in columns.items()
+    ]
+
+
 def _cells(cells: Iterable[CellLike]) -> tuple[Cell, ...]:
     return tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in cells)
 

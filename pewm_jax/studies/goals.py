@@ -13,7 +13,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from pewm_jax.config import ActionConfig, UserError
+from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.make_episode import SPLITS
 from pewm_jax.data.navigation import PathsToGoal, line_is_free, sample_free
 from pewm_jax.data.simulator import Simulator, move, open_simulator
@@ -118,6 +118,18 @@ def open_goal(
     raise UserError(
         f"{simulator.scene.name} is too small for a walk of {actions} actions that ends "
         f"{LEAST_M:g} m away: use fewer houses."
+    )
+
+
+def goal_of(config: Config, number: int, houses: int, actions: int) -> Goal:
+    """Return a task with the context, the actions and the images of a model; see ``open_goal``."""
+    return open_goal(
+        number,
+        houses=houses,
+        actions=actions,
+        context=config.data.context,
+        motion=config.model.actions,
+        size=config.model.clip.height,
     )
 
 

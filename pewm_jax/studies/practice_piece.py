@@ -92,8 +92,8 @@ class PracticeConfig:
 def make(
     world: LoadedRun,
     begun: LoadedPolicy,
-    home: Goal,
     study: PracticeConfig,
+    house: int,
     how: str,
     seed: int,
     folder: Path,
@@ -105,6 +105,7 @@ def make(
     Raises:
         UserError: a loss is not finite, or the folder contains walks with other settings.
     """
+    home = open_home(study, world.config, house)
     piece: dict[str, Any] = {"house": home.house, "walked": {}}
     act = act_of(begun)
     if how == CHANCE:
@@ -144,14 +145,7 @@ def _walk_statistics(folder: Path, home: Goal) -> dict[str, float]:
 
 def open_home(study: PracticeConfig, config: Config, house: int) -> Goal:
     """Return the first task of a house, whose context contains the agent's observations."""
-    return goals.open_goal(
-        house,
-        houses=study.houses,
-        actions=study.actions,
-        context=config.data.context,
-        motion=config.model.actions,
-        size=config.model.clip.height,
-    )
+    return goals.goal_of(config, house, study.houses, study.actions)
 
 
 def place_of(world: LoadedRun, home: Goal, motion: ActionConfig, how: str) -> PracticeEnvironment:

@@ -37,7 +37,7 @@ from pewm_jax.io.store import file_hash, inputs_hash, make_once
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.nn import target
-from pewm_jax.studies.table1_rows import Row
+from pewm_jax.studies.table1_rows import Row, as_kind
 from pewm_jax.train import loop, sharding
 from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.train.step import compile_step, initial_state, noise_key
@@ -79,12 +79,8 @@ class Study:
 
 def backbone_of(base: Config, row: Row) -> Row:
     """Return the backbone that a row starts from, as a row: without a memory, with its depth."""
-    given = {
-        field.name: getattr(base.model.memory, field.name)
-        for field in dataclasses.fields(NoMemoryConfig)
-    }
     name = "backbone" if row.depth else "backbone-without_depth"
-    return Row(name, NoMemoryConfig(**given), depth=row.depth)
+    return Row(name, as_kind(base.model.memory, NoMemoryConfig), depth=row.depth)
 
 
 def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Config:
@@ -247,11 +243,11 @@ def _step_times(study: Study, models: dict[str, Row], log: Log) -> Times:
 
 
 def _read_times(path: Path) -> Times:
+    if not path.exists():
+        return {}
     try:
         kept = json.loads(path.read_text("utf-8"))
         return {str(model): float(seconds) for model, seconds in kept.items()}
-    except FileNotFoundError:
-        return {}
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} is damaged ({error}), but it defines the lengths of trainings: restore it, or "

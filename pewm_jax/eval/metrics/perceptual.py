@@ -7,11 +7,13 @@ import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.images import colours, name_with_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.dreamsim import convert as dreamsim_weights
 from pewm_jax.models.dreamsim import model as dreamsim
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -91,26 +93,22 @@ class LPIPS:
 @functools.partial(jax.jit, static_argnums=0)
 def _distances(net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
     """Compare colours in [0, 1], frame by frame."""
-    clips, frames, height, width, _ = imagined_BTHWC.shape
-    pairs = tuple(
-        2 * x.reshape(clips * frames, height, width, 3) - 1 for x in (imagined_BTHWC, truth_BTHWC)
-    )
 
     def one(pair: tuple[Array, Array]) -> Array:
         return lpips.apply(net, params, pair[0][None], pair[1][None])[0]
 
-    return jax.lax.map(one, pairs, batch_size=_batch_size(pairs[0])).reshape(clips, frames)
+    found = _map_images(one, (_signals(imagined_BTHWC), _signals(truth_BTHWC)))
+    return found.reshape(imagined_BTHWC.shape[:2])
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _describe(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...]:
     """Return the features of colours in [0, 1]; the image axis comes first."""
-    pictures = 2 * truth_BTHWC.reshape(-1, *truth_BTHWC.shape[2:]) - 1
 
-    def one(picture: Array) -> tuple[Array, ...]:
-        return tuple(x[0] for x in lpips.describe(net, params, picture[None]))
+    def one(images: tuple[Array]) -> tuple[Array, ...]:
+        return tuple(x[0] for x in lpips.describe(net, params, images[0][None]))
 
-    return jax.lax.map(one, pictures, batch_size=_batch_size(pictures))
+    return _map_images(one, (_signals(truth_BTHWC),))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -118,32 +116,30 @@ def _distances_to_features(
     net: Net, params: Params, imagined_BTHWC: Array, truth: tuple[Array, ...]
 ) -> Array:
     """Compare colours in [0, 1] with precomputed features."""
-    clips, frames = imagined_BTHWC.shape[:2]
-    pictures = 2 * imagined_BTHWC.reshape(-1, *imagined_BTHWC.shape[2:]) - 1
 
     def one(pair: tuple[Array, tuple[Array, ...]]) -> Array:
         mine = lpips.describe(net, params, pair[0][None])
         return lpips.distance(params, mine, [x[None] for x in pair[1]])[0]
 
-    found = jax.lax.map(one, (pictures, truth), batch_size=_batch_size(pictures))
-    return found.reshape(clips, frames)
+    return _map_images(one, (_signals(imagined_BTHWC), truth)).reshape(imagined_BTHWC.shape[:2])
 
 
-def _batch_size(pictures_NHWC: Array) -> int:
-    return max(1, PIXELS // (pictures_NHWC.shape[1] * pictures_NHWC.shape[2]))
+def _signals(clips_BTHWC: Array) -> Array:
+    """Return the images of clips with colours in [0, 1] as signals in [−1, 1], (B T, H, W, 3)."""
+    return 2 * clips_BTHWC.reshape(-1, *clips_BTHWC.shape[2:]) - 1
+
+
+def _map_images(function: Callable[[Any], Any], images: tuple[Any, ...]) -> Any:
+    """Apply a function to images and what belongs to them, a bounded number at once."""
+    at_once = max(1, PIXELS // (images[0].shape[1] * images[0].shape[2]))
+    return jax.lax.map(function, images, batch_size=at_once)
 
 
 def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
-    """Read LPIPS from a file of weights; ``net`` is the required network, by default the file's.
-
-    Raises:
-        UserError: see ``models.lpips.convert.read``.
-    """
+    """Read LPIPS from a file of weights; see ``models.lpips.convert.read``."""
     found, params = lpips_weights.read(path, net)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     name = name_with_hash(found, params, lpips_weights.PUBLISHED[found])
-    return LPIPS(found, jax.device_put(params), digest, name)
+    return LPIPS(found, jax.device_put(params), file_hash(path), name)
 
 
 def select_lpips(setting: str, height: int, width: int) -> tuple[LPIPS | None, str]:

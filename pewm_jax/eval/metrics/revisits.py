@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 from pathlib import Path
 
 import jax
@@ -25,6 +24,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.images import Metric, colours, name_with_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config, size_name
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -111,7 +111,7 @@ def ways(clips_BTHWC: Array) -> tuple[Array, Array]:
 
 
 SIDE = 224
-"""Height and width of DINOv2's input, pixels."""
+"""Height and width of DINOv2's input, pixels: the multiple of the patch size nearest to it."""
 PICTURES = 16
 """Images in an encoder at once."""
 SMALL = 1e-12
@@ -179,17 +179,13 @@ def _features(network: DINOv2Config | Net, params: Params, clips_BTHWC: Array) -
     def one(picture_HWC: Array) -> Array:
         picture = 2 * picture_HWC[None] - 1
         if isinstance(network, DINOv2Config):
-            images = dinov2.preprocess(picture, _side(network), network.patch)
+            side = max(1, round(SIDE / network.patch)) * network.patch
+            images = dinov2.preprocess(picture, side, network.patch)
             return dinov2.summary(network, params, images)[0]
         return lpips.features(network, params, picture)[-1].mean((1, 2))[0]
 
     pictures = clips_BTHWC.reshape(clips * frames, *size)
     return jax.lax.map(one, pictures, batch_size=PICTURES).reshape(clips, frames, -1)
-
-
-def _side(network: DINOv2Config) -> int:
-    """Return the multiple of the patch size nearest to 224."""
-    return max(1, round(SIDE / network.patch)) * network.patch
 
 
 def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
@@ -205,7 +201,7 @@ def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
         file = lpips_weights.find(_CNNS[encoder], path)
         net, params = lpips_weights.read(file, _CNNS[encoder])
         name = name_with_hash(net, params, lpips_weights.PUBLISHED[net])
-        return Similarity(name, net, jax.device_put(params), _hash(file))
+        return Similarity(name, net, jax.device_put(params), file_hash(file))
     if encoder != "dinov2":
         raise UserError(f"there is no encoder {encoder!r}; choose one of {', '.join(ENCODERS)}.")
     if path is None:
@@ -216,10 +212,8 @@ def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
     network, params = dinov2.load(Path(path))
     params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
     return Similarity(
-        f"dinov2-{size_name(network)}", network, params, _hash(Path(path) / "weights.safetensors")
+        f"dinov2-{size_name(network)}",
+        network,
+        params,
+        file_hash(Path(path) / "weights.safetensors"),
     )
-
-
-def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

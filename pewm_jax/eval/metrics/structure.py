@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.eval.seen import visible_in
+from pewm_jax.eval.metrics.images import visible_in
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.houses.kinds import SHELL, kind_of
 from pewm_jax.types import Array, Camera
@@ -159,8 +159,8 @@ def first_visible(depth_THW: Array, camera: Camera) -> np.ndarray:
 
     The points of frame 0's pixels are projected into the other frames, with true z-depth (metres, 0
     = no measurement) and cameras. A point is visible if it lies inside the image and agrees with
-    the depth there (``seen.visible_in``), so occluded points do not count: a frame that shows none
-    shows only new places.
+    the depth there (``images.visible_in``), so occluded points do not count: a frame that shows
+    none shows only new places.
 
     Raises:
         UserError: there are no frames, or the first has no depth.

@@ -9,8 +9,6 @@ is reported with it. The kernel distance is unbiased. Both are computed in float
 from __future__ import annotations
 
 import dataclasses
-import functools
-import hashlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +18,7 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.images import colours, name_with_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
 from pewm_jax.types import Array, Params
@@ -66,14 +65,9 @@ def kernel(a_NF: np.ndarray, b_NF: np.ndarray) -> float:
             f"sets of {len(a)} and {len(b)} vectors have no kernel distance: give sets of equal "
             "size."
         )
-    inside = _cubic(a, a) + _cubic(b, b)
-    across = _cubic(a, b)
-    pairs = inside - across - across.T
+    own_a, own_b, across = ((x @ y.T / a.shape[1] + 1) ** 3 for x, y in ((a, a), (b, b), (a, b)))
+    pairs = own_a + own_b - across - across.T
     return float((pairs.sum() - np.trace(pairs)) / (len(a) * (len(a) - 1)))
-
-
-def _cubic(a_NF: np.ndarray, b_MF: np.ndarray) -> np.ndarray:
-    return (a_NF @ b_MF.T / a_NF.shape[1] + 1) ** 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,15 +79,10 @@ class Spread:
 
 
 def distance_floor(
-    distance: Distance,
-    truth_NF: np.ndarray,
-    n: int | None = None,
-    *,
-    splits: int = SPLITS,
-    seed: int = 0,
+    distance: Distance, truth_NF: np.ndarray, n: int | None = None, **draws: int
 ) -> Spread:
     """Return ``distance_of_halves`` of true clips: a distance between two disjoint sets of them."""
-    return distance_of_halves(distance, truth_NF, truth_NF, n, splits=splits, seed=seed)
+    return distance_of_halves(distance, truth_NF, truth_NF, n, **draws)
 
 
 def distance_of_halves(
@@ -208,6 +197,10 @@ class VideoDistance:
             self.distance(self.features(imagined_BTHWC), self.features(truth_BTHWC)), np.float64
         )
 
+    def kinds(self) -> dict[Kind, VideoDistance]:
+        """Return FVD and KVD with the same weights."""
+        return {kind: dataclasses.replace(self, kind=kind) for kind in DISTANCES}
+
     @property
     def distance(self) -> Distance:
         """Return the distance between sets of features."""
@@ -263,22 +256,15 @@ class VideoDistance:
 def _features(params: Params, video_BTHWC: Array) -> Array:
     """Return the logits of clips with colours in [0, 1], a bounded number of them at once."""
     at_once = max(1, FRAMES // video_BTHWC.shape[1])
-    one = functools.partial(_clip_features, params)
-    return jax.lax.map(one, 2 * video_BTHWC - 1, batch_size=at_once)
-
-
-def _clip_features(params: Params, video_THWC: Array) -> Array:
-    return i3d.apply(params, video_THWC[None])[0]
+    return jax.lax.map(
+        lambda video_THWC: i3d.apply(params, video_THWC[None])[0],
+        2 * video_BTHWC - 1,
+        batch_size=at_once,
+    )
 
 
 def read_i3d(path: Path, kind: Kind) -> VideoDistance:
-    """Read FVD or KVD from a file with the weights of I3D.
-
-    Raises:
-        UserError: see ``models.i3d.convert.read``.
-    """
+    """Read FVD or KVD from the weights of I3D; see ``models.i3d.convert.read``."""
     params = i3d_weights.read(path)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     encoder = name_with_hash(NAME, params, i3d_weights.PUBLISHED)
-    return VideoDistance(kind, jax.device_put(params), digest, encoder)
+    return VideoDistance(kind, jax.device_put(params), file_hash(path), encoder)
