@@ -86,17 +86,21 @@ def compare(
         out: the output folder; by default ``compare-TWO`` beside the first one's report.
         log: prints a line.
 
-    Returns:
-        The path of the page.
-
     Raises:
         UserError: a run has no report, or one of another version; the protocols differ; or runs
             that should differ only in the training seed differ otherwise.
     """
     groups = [[read(name) for name in names] for names in ([one, *also_one], [two, *also_two])]
     first = groups[0][0]
-    for report in (*groups[0][1:], *groups[1]):
-        _require_same_protocol(first, report)
+    for other in (*groups[0][1:], *groups[1]):
+        if first.protocol.sha256 != other.protocol.sha256:
+            raise UserError(
+                f"{first.name} and {other.name} were scored by different protocols "
+                f"({first.protocol.sha256[:12]} and {other.protocol.sha256[:12]}: "
+                f"{difference(first.protocol, other.protocol)}), so their clips cannot be paired; "
+                f"evaluate one with the other's: `pewm-jax evaluate {other.again} --protocol "
+                f"{first.folder / PROTOCOL}`."
+            )
     for group in groups:
         _require_seeds(group)
     content = content_of(*groups)
@@ -148,17 +152,6 @@ def read(name: str | Path) -> Report:
     if len(hashes) > 1 or said["weights_sha256"] != about["weights_sha256"]:
         raise UserError(f"the files of {folder} are not of one evaluation: {again}.")
     return report
-
-
-def _require_same_protocol(one: Report, two: Report) -> None:
-    if one.protocol.sha256 != two.protocol.sha256:
-        file = one.folder / PROTOCOL
-        raise UserError(
-            f"{one.name} and {two.name} were scored by different protocols "
-            f"({one.protocol.sha256[:12]} and {two.protocol.sha256[:12]}: "
-            f"{difference(one.protocol, two.protocol)}), so their clips cannot be paired; evaluate "
-            f"one with the other's: `pewm-jax evaluate {two.again} --protocol {file}`."
-        )
 
 
 def _require_seeds(group: Sequence[Report]) -> None:

@@ -123,14 +123,9 @@ def run(
 ) -> Trials:
     """Run the trials: place a block, imagine the walk, and measure persistence and visibility.
 
-    Args:
-        config: an experiment of a ``persist`` world.
-        params: its weights.
-        walks: one for each trial, of equal length, with voxels.
-        name: class of the blocks; see ``block_class``.
-        batch: number of walks imagined at once.
-        chunk: number of frames imagined per call.
-        count: number of trials after which to stop; None for all walks.
+    There is a trial for each of the walks with voxels, of equal length, until there are ``count``.
+    ``name`` is the class of the blocks and may raise, see ``block_class``. ``batch`` walks are
+    imagined at once, ``chunk`` frames per call.
     """
     model: PERSIST = config.model
     number = block_class(config, walks, name)

@@ -75,14 +75,10 @@ SHOWN = 11
 def run(
     model: str | Path, policy: str | Path, out: Path, study: PracticeConfig, log: Log = print
 ) -> Path:
-    """Let a policy practise in every house, and measure it before and after.
+    """Let a policy, the run of a NoMaD, practise in every house; measure it before and after.
 
-    Args:
-        model: a run folder, or the name of weights that ship with the library.
-        policy: the run of a NoMaD.
-        out: the output folder; the same call resumes.
-        study: the settings.
-        log: prints a line.
+    ``model`` is a run folder, or the name of weights that ship with the library. The same call
+    resumes.
 
     Returns:
         The path of the table in Markdown; in the same folder .png and ``results.json``.

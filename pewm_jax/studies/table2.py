@@ -100,13 +100,8 @@ def run(
 ) -> Path:
     """Run every method on every task, and write the table.
 
-    Args:
-        model: a run folder, or the name of weights that ship with the library.
-        out: the output folder.
-        study: the settings.
-        policy: the policy named in ``study``.
-        cost: the cost named in ``study``.
-        log: prints a line.
+    ``model`` is a run folder, or the name of weights that ship with the library; ``policy`` and
+    ``cost`` are those named in ``study``.
 
     Returns:
         The path of the table in Markdown; in the same folder .tex, .csv, .png, videos and
