@@ -63,7 +63,7 @@ HOMES = {
     "pickle": {"io/pickles"},
     "ray": {"data/collect"},
     "safetensors": {"io/tensor_files", "io/weights", "convert"},
-    "scipy": {"data", "eval/intervals", "houses"},
+    "scipy": {"data", "eval/statistics", "houses"},
     "tensorboardX": {"train/log"},
     "torch": {"convert", "eval/metrics/sam2"},
     "transformers": {"convert", "eval/metrics/sam2"},

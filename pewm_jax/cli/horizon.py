@@ -63,8 +63,8 @@ def run(settings: Settings) -> None:
     if min(settings.walks, settings.context, settings.windows, settings.trial_frames) < 1:
         raise ConfigError("--walks, --context, --windows and --trial-frames must be above 0.")
     # Imported lazily: help and errors are fast.
+    from pewm_jax.eval import horizon
     from pewm_jax.eval.loaded_run import open_run
-    from pewm_jax.report import horizon_page
 
     opened = open_run(settings.run)
     others = [(name, open_run(name)) for name in settings.beside]
@@ -79,8 +79,8 @@ def run(settings: Settings) -> None:
         "windows of each walk before each end": settings.windows,
         **{f"weights_sha256 of {name}": other.weights_hash for name, other in others},
     }
-    page = horizon_page.write(settings.out or opened.home / "horizon", facts, videos, ends)
-    print("\n".join(horizon_page.lines(facts, ends)))
+    page = horizon.write_report(settings.out or opened.home / "horizon", facts, videos, ends)
+    print("\n".join(horizon.lines(facts, ends)))
     print(f"report: {page}")
 
 

@@ -38,8 +38,6 @@ class ClipChoice:
 
     Attributes:
         episode: index of the episode.
-        name: name of the episode.
-        scene: its scene.
         start: the present frame; all earlier ones may be context.
         context_S: (S,) frames passed to ``worlds.start``, oldest first, the present last. If an
             episode has fewer, the oldest is repeated as padding; ``load_clip`` sets the depth of
@@ -71,15 +69,9 @@ def return_start(episode: Episode) -> int:
 def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) -> list[ClipChoice]:
     """Choose the clips to imagine: starts spread evenly over every episode's return path.
 
-    Args:
-        config: gives ``clip.frames``, ``data.context`` and ``evaluate.stride``.
-        episodes: held-out episodes.
-        clips: largest number of clips; fewer if the episodes have fewer distinct starts.
-        chain: number of consecutive clips from each start.
-
-    Returns:
-        The choices: the first start of every episode, then every second start, and so on, so that
-        any prefix of the list covers as many episodes as possible.
+    ``clips`` is the largest number of clips, ``chain`` the number of consecutive ones from each
+    start. The first start of every episode comes first, then every second start, and so on, so that
+    any prefix of the list covers as many episodes as possible.
 
     Raises:
         UserError: no episode is long enough.
@@ -110,15 +102,7 @@ def choose(config: Config, episodes: Sequence[Episode], clips: int, chain: int) 
 
 
 def choice_of(config: Config, episode: Episode, index: int, start: int, count: int) -> ClipChoice:
-    """Return the clip of an episode that starts at a frame.
-
-    Args:
-        config: gives ``data.context`` and ``evaluate.stride``.
-        episode: the episode.
-        index: index of the episode.
-        start: the present frame.
-        count: frames to imagine.
-    """
+    """Return the clip of an episode that starts at a frame."""
     targets = start + config.evaluate.stride * np.arange(1, count + 1)
     return ClipChoice(
         episode=index,
@@ -133,9 +117,8 @@ def choice_of(config: Config, episode: Episode, index: int, start: int, count: i
 def long_choices(config: Config, episodes: Sequence[Episode]) -> list[ClipChoice]:
     """Choose one long rollout per episode, from the start of its return path.
 
-    Returns:
-        At most ``ROLLOUTS`` rollouts of ``evaluate.video_clips`` clips, or of fewer clips if the
-        episodes are too short.
+    There are at most ``ROLLOUTS``, of ``evaluate.video_clips`` clips, or of fewer clips if the
+    episodes are too short.
 
     Raises:
         UserError: no episode is long enough for one clip.
@@ -163,26 +146,21 @@ def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) ->
 def load_clip(
     config: Config, episodes: Sequence[Episode], choice: ClipChoice, *, cameras: bool = False
 ) -> tuple[Frames, Frames, Array | Camera]:
-    """Read one chosen clip.
+    """Read one chosen clip: S context frames, N ground-truth frames, and the control.
 
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        choice: the clip.
-        cameras: whether it is driven by the recorded cameras, in six degrees of freedom, instead of
-            actions (``needs_cameras``).
-
-    Returns:
-        ``(context, targets, control)``: S context frames, N ground-truth frames, and the control
-        from the present through them: (N, 3) actions composed from the recorded poses, or (N,)
-        cameras. Padding frames of the context have depth 0 (not measured) everywhere.
+    The control leads from the present through the N frames: (N, 3) actions composed from the
+    recorded poses, or with ``cameras`` (``needs_cameras``) the (N,) recorded cameras. Padding
+    frames of the context have depth 0 (not measured) everywhere.
 
     Raises:
         UserError: the recorded actions or the planar motion of the poses do not lead to the
             recorded poses, or the frames have another size than the model's.
     """
     episode = episodes[choice.episode]
-    context = _without_padding(episode.frames(list(choice.context_S)), choice.context_S)
+    context = episode.frames(list(choice.context_S))
+    repeated = np.append(np.diff(choice.context_S) == 0, False)  # all but the last copy
+    depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
+    context = dataclasses.replace(context, depth_THW=depth)
     targets = episode.frames(list(choice.targets_N))
     size = (config.model.clip.height, config.model.clip.width)
     if targets.rgb_THWC.shape[1:3] != size:
@@ -205,13 +183,6 @@ def load_clip(
         taken = every[[index - choice.start for index in (choice.start, *choice.targets_N)]]
         _check_motion(taken, poses, choice, "recorded actions")
     return context, targets, actions_N3
-
-
-def _without_padding(context: Frames, context_S: Sequence[int]) -> Frames:
-    """Set the depth of repeated context frames to 0 in all but the last copy."""
-    repeated = np.append(np.diff(context_S) == 0, False)
-    depth = np.where(repeated[:, None, None], 0, context.depth_THW).astype(np.float32)
-    return dataclasses.replace(context, depth_THW=depth)
 
 
 _integrate = jax.jit(integrate)
@@ -245,15 +216,10 @@ def fingerprint(
 ) -> str:
     """Return a hash of all that scores depend on, except seeds, reference model and metrics.
 
-    Args:
-        config: the run's configuration, with overrides for the evaluation.
-        weights: sha256 of the weights.
-        dataset: sha256 of the data set's index.
-        lpips: sha256 of the weights of LPIPS; "" if it is not measured.
-        protocol: hash of the choices in a protocol file, except for seeds; "" if clips are chosen
-            by the settings.
-        baseline: with a protocol, sha256 of the index of the split that chooses the reprojection's
-            settings; "" if there is none.
+    ``weights``, ``dataset`` (the data set's index), ``lpips`` (its weights, "" if it is not
+    measured) and, with a protocol, ``baseline`` (the index of the split that chooses the
+    reprojection's settings) are sha256; ``protocol`` is the hash of the choices in a protocol file,
+    except for seeds.
     """
     settings = to_dict(config)
     for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src", "scs"):

@@ -31,6 +31,14 @@ from pewm_jax.worlds.rollouts import load_finished
 
 FRAMES = 16
 """Number of frames scored per episode, evenly spaced."""
+LABELS = {
+    "psnr": "colour, PSNR, dB",
+    "depth_cm": "depth error, cm",
+    "depth_relative": "depth error, relative",
+    "square_rgb": "latents of colour, mean square",
+    "square_depth": "latents of depth, mean square",
+}
+"""The scores, as they are printed."""
 
 
 def score(
@@ -50,9 +58,8 @@ def score(
         log: prints a line.
 
     Returns:
-        The file written, ``RUN/report/codec-SPLIT.json`` (``runs/NAME/report/…`` for a codec that
-        ships with the library). Scores are means over frames, then over episodes, then over scenes;
-        ``error`` is the standard error over scenes.
+        The file written, ``RUN/report/codec-SPLIT.json``. Scores are means over frames, then over
+        episodes, then over scenes; ``error`` is the standard error over scenes.
 
     Raises:
         UserError: the run, its weights or the data are missing, damaged or incompatible.
@@ -95,24 +102,20 @@ def score(
     path.parent.mkdir(parents=True, exist_ok=True)
     atomic.write_text(path, json.dumps(result, indent=1, ensure_ascii=False) + "\n")
     log(f"{folder}: {len(scenes)} scenes, {', '.join(sizes)} pixels")
-    for line in _lines(numbers):
-        log(line)
+    for name, about in LABELS.items():
+        mean, error = numbers[name]["mean"], numbers[name]["error"]
+        text = "nothing measured" if mean is None else f"{mean:.3f}"
+        log(f"  {about:<30} {text}" + (f" ± {error:.3f}" if error is not None else ""))
     return path
 
 
 def measures(model: CodecTask, params: Params, frames: Frames) -> dict[str, Array]:
-    """Return reconstruction errors of one episode's frames, encoded and decoded.
+    """Return reconstruction errors of one episode's frames, of any size that the codec accepts.
 
-    Args:
-        model: the world.
-        params: the codec's parameters.
-        frames: (T, H, W, …) of any size that the codec accepts, colours uint8.
-
-    Returns:
-        Per frame (T,): ``psnr`` of colour in dB; over measured pixels within the model's range,
-        ``depth_cm``, the mean absolute error in cm, and ``depth_relative`` (NaN if nothing was
-        measured); ``square_rgb`` and ``square_depth``, the mean squares of the normalised latents,
-        whose mean is about 1 if the frames resemble the training data.
+    Per frame (T,): ``psnr`` of colour in dB; over measured pixels within the model's range,
+    ``depth_cm``, the mean absolute error in cm, and ``depth_relative`` (NaN if nothing was
+    measured); ``square_rgb`` and ``square_depth``, the mean squares of the normalised latents,
+    whose mean is about 1 if the frames resemble the training data.
     """
     rgb = signal_from_rgb(frames.rgb_THWC)
     depth = jnp.asarray(frames.depth_THW)
@@ -152,19 +155,3 @@ def _mean_over_scenes(scenes: list[list[float]]) -> dict[str, float | None]:
         "mean": float(means.mean()) if len(means) else None,
         "error": float(means.std(ddof=1) / np.sqrt(len(means))) if many else None,
     }
-
-
-def _lines(numbers: Mapping[str, Mapping[str, float | None]]) -> list[str]:
-    units = {
-        "psnr": "colour, PSNR, dB",
-        "depth_cm": "depth error, cm",
-        "depth_relative": "depth error, relative",
-        "square_rgb": "latents of colour, mean square",
-        "square_depth": "latents of depth, mean square",
-    }
-    lines = []
-    for name, about in units.items():
-        mean, error = numbers[name]["mean"], numbers[name]["error"]
-        text = "nothing measured" if mean is None else f"{mean:.3f}"
-        lines.append(f"  {about:<30} {text}" + (f" ± {error:.3f}" if error is not None else ""))
-    return lines

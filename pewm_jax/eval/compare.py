@@ -13,13 +13,14 @@ import numpy as np
 from pewm_jax import config as configuration
 from pewm_jax import shipped
 from pewm_jax.config import Config, UserError
-from pewm_jax.eval import intervals, results
 from pewm_jax.eval import protocol as protocols
+from pewm_jax.eval import results, statistics
 from pewm_jax.eval.evaluate import METRICS, PAGE, PROTOCOL, make_folder
 from pewm_jax.eval.loaded_run import OWN
 from pewm_jax.eval.metrics.images import MASKS
 from pewm_jax.eval.protocol import Protocol, difference
 from pewm_jax.eval.results import SCHEMA as REPORT_SCHEMA
+from pewm_jax.eval.statistics import map_scores
 from pewm_jax.io import atomic
 from pewm_jax.report import compare_page
 from pewm_jax.train import runs
@@ -34,15 +35,7 @@ data, whose location does not matter."""
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """A report read from its folder.
-
-    Attributes:
-        name: name of the run, as passed by the caller.
-        folder: the report's folder.
-        metrics: the content of ``metrics.json``.
-        samples: the scores of every clip.
-        protocol: the protocol of the evaluation.
-    """
+    """A report read from its folder; ``name`` is the run's, as passed by the caller."""
 
     name: str
     folder: Path
@@ -93,17 +86,21 @@ def compare(
         out: the output folder; by default ``compare-TWO`` beside the first one's report.
         log: prints a line.
 
-    Returns:
-        The path of the page.
-
     Raises:
         UserError: a run has no report, or one of another version; the protocols differ; or runs
             that should differ only in the training seed differ otherwise.
     """
     groups = [[read(name) for name in names] for names in ([one, *also_one], [two, *also_two])]
     first = groups[0][0]
-    for report in (*groups[0][1:], *groups[1]):
-        _require_same_protocol(first, report)
+    for other in (*groups[0][1:], *groups[1]):
+        if first.protocol.sha256 != other.protocol.sha256:
+            raise UserError(
+                f"{first.name} and {other.name} were scored by different protocols "
+                f"({first.protocol.sha256[:12]} and {other.protocol.sha256[:12]}: "
+                f"{difference(first.protocol, other.protocol)}), so their clips cannot be paired; "
+                f"evaluate one with the other's: `pewm-jax evaluate {other.again} --protocol "
+                f"{first.folder / PROTOCOL}`."
+            )
     for group in groups:
         _require_seeds(group)
     content = content_of(*groups)
@@ -121,11 +118,7 @@ def compare(
 
 
 def read(name: str | Path) -> Report:
-    """Read a run's report.
-
-    Args:
-        name: a run's folder, the name of weights that ship with the library, or the folder of a
-            report itself.
+    """Read the report of a run, given by its folder, its name, or the folder of the report itself.
 
     Raises:
         UserError: there is no report, it is of another version, or its files are inconsistent.
@@ -161,17 +154,6 @@ def read(name: str | Path) -> Report:
     return report
 
 
-def _require_same_protocol(one: Report, two: Report) -> None:
-    if one.protocol.sha256 != two.protocol.sha256:
-        file = one.folder / PROTOCOL
-        raise UserError(
-            f"{one.name} and {two.name} were scored by different protocols "
-            f"({one.protocol.sha256[:12]} and {two.protocol.sha256[:12]}: "
-            f"{difference(one.protocol, two.protocol)}), so their clips cannot be paired; evaluate "
-            f"one with the other's: `pewm-jax evaluate {two.again} --protocol {file}`."
-        )
-
-
 def _require_seeds(group: Sequence[Report]) -> None:
     """Raise an error unless runs differ only in their training seeds, which must be distinct."""
     if len(group) == 1:
@@ -197,28 +179,24 @@ def _require_seeds(group: Sequence[Report]) -> None:
 
 
 def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
-    """Return the content of ``comparison.json``.
+    """Return the content of ``comparison.json``, which ``docs/evaluation.md`` describes.
 
-    Args:
-        one: reports of the first model's training seeds, all of one protocol.
-        two: likewise for the second model.
-
-    Returns:
-        See ``docs/evaluation.md``; differences are first − second.
+    Differences are first − second. Each argument has the reports of one model's training seeds, all
+    of one protocol.
     """
     reports = [*one, *two]
     protocols = [report.metrics["protocol"] for report in reports]
     nets = {each.get("lpips_name") or each["lpips_weights_sha256"] for each in protocols} - {None}
     skip = {"lpips"} if len(nets) > 1 else set()
-    measured = [_measured(group) for group in (one, two)]
+    measured = [set(_values(group, "clips", skip)[MASKS[-1]]) for group in (one, two)]
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "protocol_sha256": one[0].protocol.sha256,
         "protocol": _facts(one[0]),
-        "how": intervals.how(),
+        "how": statistics.interval_facts(),
         "lpips_name": one[0].metrics["protocol"].get("lpips_name"),
         "left_out": sorted(skip),
-        "measured_by_one": sorted((measured[0] ^ measured[1]) - skip),
+        "measured_by_one": sorted(measured[0] ^ measured[1]),
     }
     sides = {"a": one, "b": two}
     for side, group in sides.items():
@@ -227,10 +205,10 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
     for part in results.PARTS:
         houses_C = np.unique(one[0].samples.houses(part), return_inverse=True)[1]
         values = {side: _values(group, part, skip) for side, group in sides.items()}
-        averaged = {side: _map(lambda x: x.mean(0), found) for side, found in values.items()}
-        averaged["differences"] = _map(np.subtract, averaged["a"], averaged["b"])
+        averaged = {side: map_scores(lambda x: x.mean(0), found) for side, found in values.items()}
+        averaged["differences"] = map_scores(np.subtract, averaged["a"], averaged["b"])
         for side, found in averaged.items():
-            content[side][part] = _map(lambda x, h=houses_C: intervals.entry(x, h), found)
+            content[side][part] = map_scores(lambda x, h=houses_C: statistics.entry(x, h), found)
         if part == "clips":
             content["training_seeds"] = _over_seeds(values, houses_C)
             content["by_house"] = _by_house(one[0], averaged, houses_C)
@@ -257,53 +235,29 @@ def _facts(report: Report) -> dict[str, Any]:
 def _values(group: Sequence[Report], part: str, skip: set[str]) -> dict[str, dict[str, Any]]:
     """Return ``[mask][metric]`` as (K, C, …): training seeds, clips; mean over sampling seeds."""
     tables = [report.samples.table(part, report.samples.own) for report in group]
-    return {
-        mask: {
-            metric: np.stack([table[mask][metric].mean(0) for table in tables])
-            for metric in tables[0][mask]
-            if metric not in skip and all(metric in table[mask] for table in tables)
-        }
-        for mask in MASKS
-    }
-
-
-def _measured(group: Sequence[Report]) -> set[str]:
-    """Return the metrics that all runs of a group have."""
-    tables = [report.samples.table("clips", report.samples.own) for report in group]
-    return set.intersection(*(set(table[MASKS[-1]]) for table in tables))
-
-
-def _map(function: Callable[..., Any], *tables: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Apply a function to the entries ``[mask][metric]`` present in all tables."""
-    return {
-        mask: {
-            metric: function(*(table[mask][metric] for table in tables))
-            for metric in tables[0][mask]
-            if all(metric in table[mask] for table in tables)
-        }
-        for mask in MASKS
-    }
+    found = map_scores(lambda *each: np.stack([x.mean(0) for x in each]), *tables)
+    return {m: {k: x for k, x in by.items() if k not in skip} for m, by in found.items()}
 
 
 def _over_seeds(values: Mapping[str, Any], houses_C: np.ndarray) -> dict[str, Any]:
     """Return each training seed's mean over houses, and intervals over training seeds."""
 
     def means(values_KC: np.ndarray) -> list[float]:
-        return [float(intervals.over_houses(values_C, houses_C)["mean"]) for values_C in values_KC]
+        return [float(statistics.over_houses(values_C, houses_C)["mean"]) for values_C in values_KC]
 
     def entry(*groups: list[float]) -> dict[str, Any]:
         if not np.isfinite(np.concatenate(groups)).all():
             return {"mean": None, "low": None, "high": None}
-        return intervals.over_seeds(*groups)
+        return statistics.over_seeds(*groups)
 
-    per_seed = {side: _map(means, found) for side, found in values.items()}
-    found = {side: _map(entry, table) for side, table in per_seed.items()}
+    per_seed = {side: map_scores(means, found) for side, found in values.items()}
+    found = {side: map_scores(entry, table) for side, table in per_seed.items()}
     for side, table in found.items():
         for mask, by_metric in table.items():
             for metric, numbers in by_metric.items():
                 plain = per_seed[side][mask][metric]
                 numbers["per_seed"] = [value if np.isfinite(value) else None for value in plain]
-    return {**found, "differences": _map(entry, per_seed["a"], per_seed["b"])}
+    return {**found, "differences": map_scores(entry, per_seed["a"], per_seed["b"])}
 
 
 def _by_house(
@@ -312,7 +266,7 @@ def _by_house(
     """Return, per house, its clips and the difference of PSNR under each mask."""
     names, counts = np.unique(report.samples.houses("clips"), return_counts=True)
     found = {
-        mask: intervals.within_houses(averaged["differences"][mask]["psnr"], houses_C)
+        mask: statistics.within_houses(averaged["differences"][mask]["psnr"], houses_C)
         for mask in MASKS
     }
     return [

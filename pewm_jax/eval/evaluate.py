@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -16,7 +16,6 @@ from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.eval import loaded_run as runs
 from pewm_jax.eval import reproject, results, steering
 from pewm_jax.eval.clips import ClipChoice, fingerprint
-from pewm_jax.eval.coverage import score_coverage
 from pewm_jax.eval.gallery import make_gallery
 from pewm_jax.eval.long_rollouts import LongRollouts, roll_long
 from pewm_jax.eval.metrics.selection import ReportMetrics, select_metrics
@@ -31,7 +30,7 @@ from pewm_jax.eval.protocol import (
 from pewm_jax.eval.reproject import ReprojectChoice, choose_settings
 from pewm_jax.eval.results import compute_metrics
 from pewm_jax.eval.runner import Methods, ModelRunner, print_now, workers
-from pewm_jax.eval.scoring import Scored, score_table
+from pewm_jax.eval.scoring import Scored, score_coverage, score_table
 from pewm_jax.io import atomic
 from pewm_jax.io.store import ResultCache, file_hash
 from pewm_jax.nn import target
@@ -112,7 +111,7 @@ def evaluate(
     config, folder = job.config, Path(out) if out else runs.report_folder(loaded, job.config)
     processes.barrier("evaluate: begin")
     complete = is_complete(
-        folder, config, job.fingerprint, job.none_weights, job.metrics.hashes, job.validation
+        folder, config, job.fingerprint, job.none_weights, job.metrics.hashes, job.validation_hash
     )
     processes.barrier("evaluate: decided")  # nobody may write before all have checked
     if complete:
@@ -139,8 +138,7 @@ def evaluate(
     log("drawing the report …")
     metrics = _metrics(job, measured, protocol, choice)
     save_protocol(folder / PROTOCOL, protocol, {"data": str(job.split)})
-    gallery = make_gallery(config, job.episodes, measured.long)
-    _write(folder, metrics, gallery, measured.scored, measured.long)
+    _write(folder, metrics, make_gallery(config, job.episodes, measured.long), measured)
     processes.barrier("evaluate: report")
     for line in [*score_lines(metrics), *summary_lines(metrics)]:
         log(line)
@@ -149,21 +147,7 @@ def evaluate(
 
 @dataclasses.dataclass(frozen=True)
 class _Job:
-    """The inputs and settings of an evaluation.
-
-    Attributes:
-        loaded: the run.
-        has_memory: whether the run has a memory.
-        none: the reference run without a memory, or None.
-        config: the run's configuration with overrides and the settings of the protocol file.
-        protocol: the protocol file's content, or None.
-        episodes: held-out episodes.
-        metrics: the selected metrics.
-        validation: sha256 of the index of the split that chooses the reprojection's settings.
-        data_hash: sha256 of the index of the episodes.
-        fingerprint: hash of all that scores depend on.
-        trained_on: folder of the split that the run was trained on.
-    """
+    """The inputs and settings of an evaluation; ``config`` has the overrides and the protocol's."""
 
     loaded: runs.LoadedRun
     has_memory: bool
@@ -172,10 +156,8 @@ class _Job:
     protocol: Protocol | None
     episodes: EpisodeSource
     metrics: ReportMetrics
-    validation: str
+    validation_hash: str
     data_hash: str
-    fingerprint: str
-    trained_on: Path
 
     @property
     def split(self) -> Path:
@@ -187,13 +169,21 @@ class _Job:
         """Return the hash of the weights of ``none``, or ""."""
         return self.none.weights_hash if self.none else ""
 
+    @property
+    def fingerprint(self) -> str:
+        """Return the hash of all that scores depend on."""
+        return fingerprint(
+            self.config,
+            self.loaded.weights_hash,
+            self.data_hash,
+            self.metrics.lpips.sha256 if self.metrics.lpips else "",
+            self.protocol.pieces_sha256 if self.protocol else "",
+            self.validation_hash if self.protocol else "",
+        )
+
 
 def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
-    """Load the data, the metrics and the reference run of an evaluation.
-
-    Raises:
-        UserError: a part is missing, or does not fit the run.
-    """
+    """Load the data, the metrics and the reference run; raise if a part is missing or unfit."""
     has_memory = runs.has_memory(loaded)
     config, protocol = apply_protocol_file(override(loaded.config, **changes), changes)
     split = Path(config.data.path) / config.evaluate.split
@@ -206,27 +196,8 @@ def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
         ids=all(episodes[index].has_ids for index in range(len(episodes))),
     )
     validation = reproject.data_hash(config)
-    name = fingerprint(
-        config,
-        loaded.weights_hash,
-        data_hash,
-        metrics.lpips.sha256 if metrics.lpips else "",
-        protocol.pieces_sha256 if protocol else "",
-        validation if protocol else "",
-    )
-    trained_on = Path(loaded.config.data.path) / TRAINED_ON
     return _Job(
-        loaded,
-        has_memory,
-        none,
-        config,
-        protocol,
-        episodes,
-        metrics,
-        validation,
-        data_hash,
-        name,
-        trained_on,
+        loaded, has_memory, none, config, protocol, episodes, metrics, validation, data_hash
     )
 
 
@@ -236,38 +207,17 @@ def _methods(
     """Return the methods to evaluate."""
 
     def runner(run: runs.LoadedRun, config: Config) -> ModelRunner:
-        return ModelRunner(
-            config,
-            run.params,
-            job.config.evaluate.batch,
-            job.config.data.context,
-            log,
-            cameras=cameras,
-            devices=jax.local_devices(),
-        )
+        size, context = job.config.evaluate.batch, job.config.data.context
+        devices = jax.local_devices()
+        return ModelRunner(config, run.params, size, context, log, cameras=cameras, devices=devices)
 
-    return Methods(
-        runner(job.loaded, job.config),
-        choice.settings,
-        runner(job.none, job.none.config) if job.none else None,
-        job.none_weights,
-        job.has_memory,
-    )
+    model = runner(job.loaded, job.config)
+    none = runner(job.none, job.none.config) if job.none else None
+    return Methods(model, choice.settings, none, job.none_weights, job.has_memory)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Measured:
-    """The measurements of an evaluation.
-
-    Attributes:
-        scored: errors of the clips.
-        long: errors of the long rollouts.
-        mirror: the mirror test, or None.
-        coverage: shares of the pixels that the map covers, or None.
-        steered: PSNR with true, shuffled and no actions, or None.
-        about: descriptions of the mirror test and of steering, for the protocol.
-        cameras: whether cameras drive the model.
-    """
+class _Measured(NamedTuple):
+    """The measurements of an evaluation; None for what was not measured."""
 
     scored: Scored
     long: LongRollouts
@@ -275,7 +225,6 @@ class _Measured:
     coverage: dict[str, float] | None
     steered: steering.Steered | None
     about: dict[str, str | None]
-    cameras: bool
 
 
 def _measure(
@@ -300,28 +249,21 @@ def _measure(
         params = job.loaded.params
         steered, about_steering = steering.score(config, params, episodes, clips, cache, log)
     about = {"mirror": way_out(config, rollouts)[1], "steering": about_steering}
-    return _Measured(scored, long, mirrored, covered, steered, about, methods.model.cameras)
+    return _Measured(scored, long, mirrored, covered, steered, about)
 
 
 def _metrics(
     job: _Job, measured: _Measured, protocol: Protocol, choice: ReprojectChoice
 ) -> dict[str, Any]:
     """Return the content of ``metrics.json``."""
-    metrics = compute_metrics(
-        job.config,
-        measured.scored,
-        measured.long,
-        measured.mirror,
-        job.metrics.i3d,
-        job.metrics.structure,
-    )
-    metrics |= {
-        "coverage": measured.coverage,
-        "steering": measured.steered and measured.steered.facts(),
-    }
-    if measured.cameras:
+    i3d, consistency = job.metrics.i3d, job.metrics.structure
+    metrics = compute_metrics(job.config, *measured[:3], i3d, consistency)
+    metrics["coverage"] = measured.coverage
+    metrics["steering"] = measured.steered and measured.steered.facts()
+    if protocol.control == "cameras":
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
-    metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], job.trained_on) | {
+    trained_on = Path(job.loaded.config.data.path) / TRAINED_ON
+    metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
         "reproject": choice.facts(),
         "none": runs.none_facts(job.none, job.loaded) if job.none else None,
         **job.metrics.about,
@@ -338,33 +280,23 @@ def _metrics(
     return metrics
 
 
-def _write(
-    folder: Path,
-    metrics: dict[str, Any],
-    gallery: Gallery,
-    scored: Scored,
-    long: LongRollouts,
-) -> None:
+def _write(folder: Path, metrics: dict[str, Any], gallery: Gallery, measured: _Measured) -> None:
     """Write all files of a report except its protocol; ``metrics.json`` last, as a marker."""
     (folder / METRICS).unlink(missing_ok=True)
     names = ("protocol_sha256", "weights_sha256", "lpips_weights_sha256", "seeds")
     facts = {name: metrics["protocol"][name] for name in names}
-    results.save_samples(folder, results.gather_samples(scored, long, **facts))
-    _save_pictures(folder, gallery)
-    page = evaluation_page(metrics, gallery)
-    atomic.write_text(folder / PAGE, page)
-    metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
-    atomic.write_text(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
-
-
-def _save_pictures(folder: Path, gallery: Gallery) -> None:
-    """Write the strip as image and animation, and the frames of each long rollout and method."""
+    samples = results.gather_samples(measured.scored, measured.long, **facts)
+    results.save_samples(folder, samples)
     save_png(folder / STRIP, gallery.strip)
     (folder / MOVING).write_bytes(gallery.moving)
     atomic.remove(folder / ROWS)
     for index, row in enumerate(gallery.rows):
         for name, picture in row.items():
             save_png(folder / ROWS / f"{index:02d}-{name}.png", picture)
+    page = evaluation_page(metrics, gallery)
+    atomic.write_text(folder / PAGE, page)
+    metrics["page_sha256"] = hashlib.sha256(page.encode()).hexdigest()
+    atomic.write_text(folder / METRICS, json.dumps(metrics, indent=1, allow_nan=False) + "\n")
 
 
 def make_folder(folder: Path) -> None:
@@ -391,16 +323,10 @@ def is_complete(
 ) -> bool:
     """Return whether a folder contains the complete report for these weights and this protocol.
 
-    Args:
-        folder: the report's folder.
-        config: the run's configuration, with overrides for the evaluation.
-        name: the fingerprint of weights and protocol.
-        none_weights: sha256 of the weights of the reference model without a memory; "" if there is
-            none.
-        extras: protocol entries of optional metrics.
-        validation: sha256 of the index of the split that chooses the reprojection's settings; "" if
-            there is none. Reports of version 0.1 do not contain it and count as incomplete: their
-            partial scores are kept, and the report is written again.
+    ``name`` is the fingerprint, ``extras`` the protocol entries of optional metrics. ``validation``
+    is the sha256 of the index of the split that chooses the reprojection's settings; reports of
+    version 0.1 do not contain it and count as incomplete: their partial scores are kept, and the
+    report is written again.
     """
     try:
         metrics = json.loads((folder / METRICS).read_text("utf-8"))
@@ -422,15 +348,10 @@ def is_complete(
 
 
 def held_out(scenes: Sequence[str], trained_on: Path) -> dict[str, Any]:
-    """Compare the names of the scored scenes with those of the training scenes.
+    """Compare the names of the scored scenes with those of the training split's scenes.
 
-    Args:
-        scenes: names of the scored scenes.
-        trained_on: folder of the training split.
-
-    Returns:
-        ``held_out``: True if no scene is shared, False if some are, None if the training data is
-        not available; ``trained_scenes``: the scored scenes that are shared.
+    Returns ``held_out``, True if no scene is shared, False if some are, None if the training data
+    is not available; and ``trained_scenes``, the scored scenes that are shared.
     """
     try:
         source = EpisodeSource(trained_on)

@@ -12,10 +12,11 @@ from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.clips import ClipChoice, load_clip
 from pewm_jax.eval.long_rollouts import LongRollouts
-from pewm_jax.eval.seen import TOLERANCE_M, TOLERANCE_RELATIVE, seen_masks
+from pewm_jax.eval.metrics.images import TOLERANCE_M, TOLERANCE_RELATIVE, seen_masks
 from pewm_jax.geometry.actions import heading
 from pewm_jax.report.evaluation_page import Gallery
 from pewm_jax.report.pictures import (
+    after_present,
     as_bytes,
     dim,
     enlarge,
@@ -33,19 +34,19 @@ ABOVE_CAMERA_M = 0.4
 DOT_M = 0.1
 """Size at which points of a memory without cells are drawn, metres."""
 CAPTIONS = {
+    "truth": "truth",
     "memory": "with its map",
     "empty": "empty map",
     "model": "no memory",
     "reproject": "reprojected",
 }
-"""The methods in images, in order, with their labels."""
+"""The ground truth and the methods in images, in order, with their labels."""
 HOLD = 4
 """Number of video frames for which the observed image is shown."""
 MASKS_NOTE = (
     "Pixels that count as seen before are in colour, the others grey. A pixel counts as seen if "
-    "its true 3D point projects into an observed frame whose true depth agrees within the "
-    f"larger of {100 * TOLERANCE_M:.0f} cm and {100 * TOLERANCE_RELATIVE:.0f} %. No network is "
-    "involved."
+    "its true 3D point projects into an observed frame whose true depth agrees within the larger "
+    f"of {100 * TOLERANCE_M:.0f} cm and {100 * TOLERANCE_RELATIVE:.0f} %. No network is involved."
 )
 ABOVE_NOTE = (
     "Each square is one cell of the model's 3D map in its stored colour, drawn from bottom to top. "
@@ -58,13 +59,13 @@ ABOVE_NOTE = (
 
 @dataclasses.dataclass(frozen=True)
 class _Rollout:
-    """A long rollout: ground-truth frames and each method's (colours, depth)."""
+    """A long rollout; by method its colours and depth from the present frame on, T + 1 frames."""
 
     choice: ClipChoice
     context: Frames
     truth: Frames
     seen_THW: np.ndarray
-    imagined: dict[str, tuple[np.ndarray, np.ndarray]]
+    frames: dict[str, tuple[np.ndarray, np.ndarray]]
 
 
 def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts) -> Gallery:
@@ -79,14 +80,12 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
     count = len(rollout.truth.depth_THW)
     steps = picture_steps(count)
     names = ["observed" if step == 0 else f"step {step}" for step in steps]
-    truth = _with_present(rollout.context, as_bytes(rollout.truth.rgb_THWC))
-    rows = [("truth", [truth[step] for step in steps])]
-    for method, (rgb, _) in rollout.imagined.items():
-        rows.append(
-            (CAPTIONS[method], [_with_present(rollout.context, rgb)[step] for step in steps])
-        )
-    seen = np.concatenate([np.ones_like(rollout.seen_THW[:1]), rollout.seen_THW])
-    masked = [dim(enlarge(truth[step], 128), _enlarge_mask(seen[step], 128)) for step in steps]
+    rows = [(CAPTIONS[name], list(rgb[steps])) for name, (rgb, _) in rollout.frames.items()]
+    truth, seen = rows[0][1], np.concatenate([rollout.seen_THW[:1] | True, rollout.seen_THW])
+    masked = [
+        dim(enlarge(picture, 128), _enlarge_mask(mask, 128))
+        for picture, mask in zip(truth, seen[steps], strict=True)
+    ]
     return Gallery(
         videos=[_video(config, long, item) for item in shown],
         strip=grid(rows, names),
@@ -96,23 +95,17 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
             "rollouts shown above it is the one with the most pixels seen before."
         ),
         moving=_moving(rollout),
-        masks=grid([("truth", [truth[step] for step in steps]), ("seen before", masked)], names),
+        masks=grid([rows[0], ("seen before", masked)], names),
         masks_note=MASKS_NOTE,
         above=_above(config, long, best, rollout)
         if "first_points" in long.kept.get("memory", {})
         else None,
         above_note=ABOVE_NOTE,
-        rows=[_rows(item, steps) for item in shown],
+        rows=[
+            {name: np.concatenate(list(rgb[steps]), 1) for name, (rgb, _) in item.frames.items()}
+            for item in shown
+        ],
     )
-
-
-def _rows(item: _Rollout, steps: np.ndarray) -> dict[str, np.ndarray]:
-    colours = {"truth": as_bytes(item.truth.rgb_THWC)}
-    colours |= {method: rgb for method, (rgb, _) in item.imagined.items()}
-    return {
-        name: np.concatenate(list(_with_present(item.context, rgb)[steps]), axis=1)
-        for name, rgb in colours.items()
-    }
 
 
 def _gather(
@@ -121,16 +114,10 @@ def _gather(
     choice = long.scored.choices[index]
     context, truth, _ = load_clip(config, episodes, choice, cameras=True)
     seen, _ = seen_masks(truth, context)
-    imagined = {
-        method: (long.kept[method]["rgb"][index], long.kept[method]["depth"][index])
-        for method in CAPTIONS
-        if method in long.kept
-    }
-    return _Rollout(choice, context, truth, np.asarray(seen), imagined)
-
-
-def _with_present(context: Frames, rgb_THWC: np.ndarray) -> np.ndarray:
-    return np.concatenate([as_bytes(np.asarray(context.rgb_THWC[-1:])), rgb_THWC])
+    made = {"truth": (truth.rgb_THWC, truth.depth_THW)}
+    made |= {name: (kept["rgb"][index], kept["depth"][index]) for name, kept in long.kept.items()}
+    frames = {name: after_present(context, *made[name]) for name in CAPTIONS if name in made}
+    return _Rollout(choice, context, truth, np.asarray(seen), frames)
 
 
 def _enlarge_mask(mask_HW: np.ndarray, width: int) -> np.ndarray:
@@ -142,13 +129,7 @@ def _enlarge_mask(mask_HW: np.ndarray, width: int) -> np.ndarray:
 
 
 def _video(config: Config, long: LongRollouts, item: _Rollout) -> tuple[str, bytes]:
-    depth0 = np.asarray(item.context.depth_THW[-1:])
-    columns = [("truth", as_bytes(item.truth.rgb_THWC), item.truth.depth_THW)]
-    columns += [(CAPTIONS[method], rgb, depth) for method, (rgb, depth) in item.imagined.items()]
-    columns = [
-        (name, _with_present(item.context, rgb), np.concatenate([depth0, depth]))
-        for name, rgb, depth in columns
-    ]
+    columns = [(CAPTIONS[name], rgb, depth) for name, (rgb, depth) in item.frames.items()]
     count = len(item.truth.depth_THW)
     share = item.seen_THW.mean((1, 2))
     footers = ["the present frame, observed by all"] + [
@@ -166,9 +147,7 @@ def _video(config: Config, long: LongRollouts, item: _Rollout) -> tuple[str, byt
 
 
 def _moving(item: _Rollout) -> bytes:
-    columns = [("truth", as_bytes(item.truth.rgb_THWC))]
-    columns += [(CAPTIONS[method], rgb) for method, (rgb, _) in item.imagined.items()]
-    frames = small_frames([(name, _with_present(item.context, rgb)) for name, rgb in columns])
+    frames = small_frames([(CAPTIONS[name], rgb) for name, (rgb, _) in item.frames.items()])
     return encode_gif([frames[0]] * (HOLD - 1) + frames)
 
 

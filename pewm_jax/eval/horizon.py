@@ -1,5 +1,7 @@
 """Long rollouts of several worlds: hundreds of frames from one start by the recorded actions.
 
+``write_report`` writes the scores as JSON and as a page, with a strip of images and a video.
+
 PERSIST's protocol (arXiv 2603.03482): windows of 16 frames that end at 200, 400 and 600 imagined
 frames of held-out walks are compared with the ground truth as sets (FVD, KVD). In addition, PSNR
 per segment of the walk measures stability over time; for ``persist`` worlds also the PSNR of the
@@ -10,7 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -21,10 +25,14 @@ from pewm_jax import worlds
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.metrics.images import psnr, unit_colours
-from pewm_jax.eval.metrics.videos import DISTANCES, VideoDistance
+from pewm_jax.eval.metrics.videos import VideoDistance
 from pewm_jax.geometry.actions import PLANAR
+from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
-from pewm_jax.report.pictures import as_bytes
+from pewm_jax.report.page import Facts, Figure, Section, Text, render
+from pewm_jax.report.pictures import as_bytes, grid, save_png
+from pewm_jax.report.table import Cell, row
+from pewm_jax.report.video import encode_h264, small_frames
 from pewm_jax.types import Camera, Control, Params
 from pewm_jax.worlds.persist import world as persist
 from pewm_jax.worlds.persist.world import PERSIST
@@ -33,6 +41,17 @@ WINDOW = 16
 """Frames per window."""
 CHUNK = 40
 """Frames imagined per call."""
+SHOWN = 8
+"""Number of frames of a walk in the strip."""
+FRAMES_PER_SECOND = 12
+NAMES = {
+    "truth": "truth",
+    "bound": "its renderer, true voxels",
+    "known": "started from a known grid",
+    "world": "the world itself",
+    "without": "without its voxels",
+}
+"""Labels of the methods; other worlds are labelled with their run's name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +59,6 @@ class RecordedWalk:
     """A held-out walk.
 
     Attributes:
-        name: name of the episode.
         context: (S,) observed frames, the present last.
         actions_T3: (T, 3) recorded actions after the present frame.
         truth_THWC: (T, H, W, 3) uint8 colours of the frames after these actions.
@@ -102,15 +120,10 @@ def imagine_walks(
     known: bool = False,
     label: str = "imagining",
 ) -> np.ndarray:
-    """Imagine all walks in one batch and return (B, T, H, W, 3) uint8 colours.
+    """Imagine walks of equal length in one batch; return (B, T, H, W, 3) uint8 colours.
 
-    Args:
-        config: the experiment.
-        params: its weights.
-        walks: walks of equal length.
-        memory: if False, each clip is imagined only from the last frame of the previous one.
-        known: whether a ``persist`` world starts from the recorded grid of the present frame.
-        label: label of the progress line.
+    Without ``memory`` each clip is imagined only from the last frame of the previous one. With
+    ``known`` a ``persist`` world starts from the recorded grid of the present frame.
     """
     model = config.model
     each = CHUNK if memory else model.clip.frames - 1
@@ -186,7 +199,7 @@ def distances(
     i3d: VideoDistance,
 ) -> dict[str, Any]:
     """Return FVD and KVD of all methods at each end, with their floors."""
-    kinds = {kind: dataclasses.replace(i3d, kind=kind) for kind in DISTANCES}
+    kinds = i3d.kinds()
     found: dict[str, Any] = {name: {} for name in made}
     with Meter("I3D", len(ends) * (len(made) + 1), "sets") as meter:
         for end in ends:
@@ -219,3 +232,100 @@ def _stack(trees: Sequence[Any]) -> Any:
 
 def _fold_keys(keys: Any, at: int) -> Any:
     return jax.vmap(jax.random.fold_in, (0, None))(keys, jnp.uint32(at))
+
+
+def write_report(
+    folder: Path, facts: Mapping[str, Any], videos: Mapping[str, np.ndarray], ends: Sequence[int]
+) -> Path:
+    """Write the report and return the page's path.
+
+    ``facts`` are plain values: ``psnr`` and optionally ``distances`` by method, ``edits``,
+    ``protocol``; ``videos`` are (B, T, H, W, 3) uint8 colours by method, ``truth`` first; ``ends``
+    the last frames of the segments.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    atomic.write_text(folder / "horizon.json", json.dumps(facts, indent=1) + "\n")
+    count = next(iter(videos.values())).shape[1]
+    frames = np.linspace(0, count - 1, SHOWN).round().astype(int)
+    rows = [(_name(name), [video[0, t] for t in frames]) for name, video in videos.items()]
+    save_png(folder / "horizon.png", grid(rows, [str(t + 1) for t in frames], cell=112))
+    columns = [(_name(name), video[0]) for name, video in videos.items()]
+    pictures = [x[: x.shape[0] // 2 * 2, : x.shape[1] // 2 * 2] for x in small_frames(columns)]
+    with atomic.replacing(folder / "horizon.mp4") as partial:
+        partial.write_bytes(encode_h264(pictures, FRAMES_PER_SECOND))
+    page = folder / "horizon.html"
+    atomic.write_text(page, _page(facts, ends))
+    return page
+
+
+def lines(facts: Mapping[str, Any], ends: Sequence[int]) -> list[str]:
+    """Return the lines for the terminal: one per method."""
+    said = [f"PSNR in dB of frames {', '.join(_spans(ends))}:"]
+    for name, values in facts["psnr"].items():
+        said.append(f"  {_name(name):<26}" + "  ".join(f"{value:6.2f}" for value in values))
+    for name, found in facts.get("distances", {}).items():
+        scores = ", ".join(
+            f"{end}: FVD {one['fvd']['value']:.0f}, KVD {one['kvd']['value']:.2f} "
+            f"({one['fvd']['clips']} clips)"
+            for end, one in found.items()
+        )
+        said.append(f"  {_name(name)}: {scores}")
+    return [*said, *sentences(facts)]
+
+
+def sentences(facts: Mapping[str, Any]) -> list[str]:
+    """Return sentences about a voxel world: its autoencoder, and blocks placed in it."""
+    said = []
+    if "autoencoder" in facts:
+        back = facts["autoencoder"]
+        said.append(
+            f"The 3D VAE reconstructs {100 * back['occupied']:.1f} % of the occupied cells with "
+            f"their class ({100 * back['filled']:.1f} % as occupied) and {100 * back['empty']:.1f} "
+            f"% of the empty ones, of {back['grids']} recorded grids."
+        )
+    if "edits" in facts:
+        edits = facts["edits"]
+        said.append(
+            f"Placed blocks that persisted: {edits['stayed']} of {edits['trials']} "
+            f"({100 * edits['share_of_cells']:.0f} % of their cells; {edits['without_room']} more "
+            f"walks had no room); in {edits['frames_in_window']} of {edits['frames']} frames a "
+            "part was in the window that may change, where a known cell changes if another class "
+            f"is likelier by {edits['hold']:g} nats. The image changed at the block in "
+            f"{edits['changed_in_sight']} of {edits['frames_in_sight']} frames in which it was "
+            "visible."
+        )
+    return said
+
+
+def _spans(ends: Sequence[int]) -> list[str]:
+    """Return the names of the segments between ends, such as 1–200 and 201–400."""
+    return [f"{low + 1}–{high}" for low, high in zip((0, *ends[:-1]), ends, strict=True)]
+
+
+def _name(name: str) -> str:
+    return NAMES.get(name, name)
+
+
+def _page(facts: Mapping[str, Any], ends: Sequence[int]) -> str:
+    rows = [row(_name(name), *map(Cell, values)) for name, values in facts["psnr"].items()]
+    sections = [Section.of_table("PSNR in dB, by frames", ["", *_spans(ends)], rows)]
+    if "bound" in facts["psnr"]:
+        note = "The renderer with the true voxels and cameras is an upper bound of the world."
+        sections.append(Section.of_note(note))
+    if facts.get("distances"):
+        heads = ["", "frames before", "FVD", "KVD", "clips"]
+        rows = []
+        for name, found in facts["distances"].items():
+            for end, one in found.items():
+                values = Cell(one["fvd"]["value"], 0), Cell(one["kvd"]["value"])
+                rows.append(row(_name(name), end, *values, str(one["fvd"]["clips"])))
+        sections.append(Section.of_table("Windows of 16 frames, as sets", heads, rows))
+    strip = Figure("horizon.png", alt="Frames of a walk.")
+    film = Figure("horizon.mp4", media="video/mp4")
+    sections.append(Section("", [*map(Text, sentences(facts)), strip, film]))
+    protocol = [(str(name), str(value)) for name, value in facts["protocol"].items()]
+    sections.append(Section("How it was measured", [Facts(protocol)]))
+    opening = (
+        "Each walk starts with a few observed frames and continues with the recorded actions only."
+    )
+    return render("Long horizons", [Text(opening, "lead")], sections)

@@ -27,8 +27,6 @@ class LoadedRun:
     Attributes:
         folder: folder of its configuration and weights; may be read-only.
         home: folder to which its reports are written.
-        config: its configuration.
-        params: its weights.
         weights_hash: sha256 of the weights file.
     """
 
@@ -50,36 +48,21 @@ class LoadedRun:
         }
 
 
-def folders(run: str | Path) -> tuple[Path, Path]:
-    """Return the folder of a run and the folder for its reports.
-
-    Args:
-        run: a run folder, or the name of a model that ships with the library: its files are in the
-            package, which is not written to, and its reports go to ``runs/NAME``.
-
-    Raises:
-        UserError: there is no such folder.
-    """
-    folder = shipped.find(run)
-    if not folder.is_dir():
-        raise UserError(f"{run} does not exist; train a model first, e.g. `pewm-jax train demo`.")
-    return folder, shipped.home(run)
-
-
 def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
-    """Load a run of a world model.
+    """Load a run of a world model, by its folder or the name of a model that ships.
 
-    Args:
-        run: a run folder, or the name of a model that ships with the library.
-        config: its configuration, if already loaded.
+    The files of a model that ships are in the package, which is not written to; its reports go to
+    ``runs/NAME``.
 
     Raises:
         UserError: it is missing, damaged, or of a world without reports.
     """
-    folder, home = folders(run)
+    folder = shipped.find(run)
+    if not folder.is_dir():
+        raise UserError(f"{run} does not exist; train a model first, e.g. `pewm-jax train demo`.")
     config, params = load_finished(folder, config=config)
     require_world(config.model, f"evaluating {run}")
-    return LoadedRun(folder, home, config, params, file_hash(folder / WEIGHTS))
+    return LoadedRun(folder, shipped.home(run), config, params, file_hash(folder / WEIGHTS))
 
 
 def has_memory(loaded: LoadedRun) -> bool:
@@ -120,12 +103,7 @@ def _require_all_steps(loaded: LoadedRun) -> None:
 
 
 def report_folder(loaded: LoadedRun, config: Config) -> Path:
-    """Return the folder of a report: ``report``, or ``report-NAME`` for other data.
-
-    Args:
-        loaded: the run.
-        config: its configuration, with overrides for the evaluation.
-    """
+    """Return the folder of a report: ``report``, or ``report-NAME`` for other data."""
     data, split = Path(config.data.path), config.evaluate.split
     other = []
     if data.resolve() != Path(loaded.config.data.path).resolve():

@@ -31,7 +31,6 @@ class LongRollouts:
     """Scored long rollouts; the frames of the first few are stored for display.
 
     Attributes:
-        scored: errors over all of them.
         chain: number of consecutive clips.
         shown: number of rollouts whose frames are stored.
         kept: per method ``rgb`` (shown, N, H, W, 3) uint8 and ``depth`` (shown, N, H, W) metres;
@@ -58,10 +57,8 @@ def roll_long(
     """Make long rollouts with every method (first seed), score all, and store the first few.
 
     Without ``lpips`` it is not measured. Without ``choices`` they are those of ``long_choices``.
-    Several processes share the work, and all return the whole result.
-
-    Raises:
-        UserError: as for ``scoring.score_table``.
+    Several processes share the work, and all return the whole result. Errors are those of
+    ``scoring.score_table``.
     """
     if choices is None:
         choices = long_choices(config, episodes)
@@ -69,17 +66,23 @@ def roll_long(
     shown, seed = min(config.evaluate.videos, len(choices)), config.evaluate.seeds[0]
     starts = range(0, len(choices), size)
 
+    def shown_from(first: int) -> int:
+        return min(max(shown - first, 0), size, len(choices) - first)
+
     def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
         methods.prepare(method for method, _ in todo)
         total = count * sum(min(size, len(choices) - first) for _, first in todo)
-        loaded: tuple[int, Batch] | None = None
+
+        @functools.lru_cache(1)
+        def load(first: int) -> Batch:
+            some, cameras = choices[first : first + size], methods.model.cameras
+            return load_batch(config, episodes, some, first, cameras=cameras)
+
         with Meter("long rollouts", total, "frames") as meter:
             for method, first in todo:
-                if loaded is None or loaded[0] != first:
-                    some, cameras = choices[first : first + size], methods.model.cameras
-                    loaded = first, load_batch(config, episodes, some, first, cameras=cameras)
-                batch, here = loaded[1], _shown_count(shown, first, len(choices), size)
-                yield (method, first), _roll_batch(config, methods, method, batch, here, lpips)
+                batch = load(first)
+                made = _roll_batch(config, methods, method, batch, shown_from(first), lpips)
+                yield (method, first), made
                 meter.advance(count * batch.real)
         log(meter.summary())
 
@@ -89,9 +92,7 @@ def roll_long(
         work,
         cache=cache,
         what="long rollouts",
-        is_usable=lambda key, arrays: (
-            len(arrays["rgb"]) >= _shown_count(shown, key[1], len(choices), size)
-        ),
+        is_usable=lambda key, arrays: len(arrays["rgb"]) >= shown_from(key[1]),
         workers=workers(),
         is_light=lambda key: key[0] not in SAMPLED,
     )
@@ -102,11 +103,6 @@ def roll_long(
     sums = {method: piece["sums"][None] for method, piece in kept.items()}
     chain = count // (config.model.clip.frames - 1)
     return LongRollouts(Scored(choices, sums), chain, shown, kept)
-
-
-def _shown_count(shown: int, first: int, rollouts: int, size: int) -> int:
-    """Return the number of rollouts of a batch to display."""
-    return min(max(shown - first, 0), size, rollouts - first)
 
 
 def _concatenate(parts: Sequence[dict[str, np.ndarray]], shown: int) -> dict[str, np.ndarray]:
@@ -148,21 +144,14 @@ def _roll_batch(
     return kept
 
 
-def occupied(config: Config, maps: Any) -> np.ndarray:
-    """Return the number of points in each map of a batch, (B,): cells, surfels or patches."""
-    return np.asarray(_occupied(config, maps))
-
-
 @functools.partial(jax.jit, static_argnums=0)
-def _occupied(config: Config, maps: Any) -> jax.Array:
+def occupied(config: Config, maps: Any) -> jax.Array:
+    """Return the number of points in each map of a batch, (B,): cells, surfels or patches."""
     return jax.vmap(lambda one: config.model.memory_points(one)[2].sum())(maps)
 
 
 def _map_points(config: Config, maps: Any, shown: int, when: str) -> dict[str, np.ndarray]:
     maps = jax.tree.map(lambda leaf: leaf[:shown], maps)
-    points, features, valid, _ = jax.vmap(config.model.memory_points)(maps)
-    return {
-        f"{when}_points": np.asarray(points),
-        f"{when}_features": np.asarray(features),
-        f"{when}_valid": np.asarray(valid),
-    }
+    found = jax.vmap(config.model.memory_points)(maps)
+    names = ("points", "features", "valid")
+    return {f"{when}_{name}": np.asarray(x) for name, x in zip(names, found[:3], strict=True)}

@@ -10,6 +10,7 @@ shows one image is perfectly consistent.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval import intervals
+from pewm_jax.eval import statistics
 from pewm_jax.eval.clips import ClipChoice, load_clip, stack
 from pewm_jax.eval.metrics import Revisit
 from pewm_jax.eval.metrics.images import psnr, unit_colours
@@ -70,9 +71,7 @@ class Mirror:
 def way_out(config: Config, rollouts: Sequence[ClipChoice]) -> tuple[int, str]:
     """Return the number of frames on the way out (0 for no test), and a description.
 
-    Args:
-        config: ``evaluate.mirror`` and the clip length are used; whole clips are imagined.
-        rollouts: the long rollouts.
+    ``evaluate.mirror`` and the clip length are used; whole clips are imagined.
     """
     asked, there = config.evaluate.mirror, len(rollouts[0].targets_N)
     if asked == 0:
@@ -106,19 +105,10 @@ def mirror_test(
 ) -> Mirror | None:
     """Run the mirror test with every method that is a network (first seed); None if it is skipped.
 
-    Results in ``cache`` are reused; several processes share the work.
-
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        methods: the methods.
-        cache: where results are stored.
-        rollouts: the long rollouts, whose first frames are the paths.
-        measures: metrics that compare both visits (``metrics.selection.select_revisits``).
-        log: prints a line.
-
-    Raises:
-        UserError: as for ``scoring.score_table``.
+    The first frames of the long rollouts are the paths, ``measures``
+    (``metrics.selection.select_revisits``) compare both visits. Results in ``cache`` are reused;
+    several processes share the work. Errors are
+    those of ``scoring.score_table``.
     """
     out, _ = way_out(config, rollouts)
     if not out:
@@ -126,11 +116,13 @@ def mirror_test(
     choices = [dataclasses.replace(one, targets_N=one.targets_N[:out]) for one in rollouts]
     seed, size = config.evaluate.seeds[0], config.evaluate.batch
     starts = range(0, len(choices), size)
+    content = [VERSION, [[n, getattr(m.compare, "sha256", "")] for n, m in measures.items()]]
+    digest = inputs_hash(content)[:12]
     everyone = (*[name for name in methods.names if name in SAMPLED], TRUTH)
 
     def name(key: tuple[str, int]) -> str:
         who = TRUTH if key[0] == TRUTH else methods.piece(key[0])
-        return f"mirror-{who}-seed{seed}-out{out}-{_digest(measures)}-clip{key[1]:04d}"
+        return f"mirror-{who}-seed{seed}-out{out}-{digest}-clip{key[1]:04d}"
 
     def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
         methods.prepare(method for method, _ in todo)
@@ -140,9 +132,9 @@ def mirror_test(
                 some = choices[first : first + size]
                 batch = _there_and_back(config, episodes, some, first, methods.model.cameras)
                 if method == TRUTH:
-                    others = [choices[(first + k - 1) % len(choices)] for k in range(len(some))]
                     other = None
                     if len(choices) > 1:
+                        others = [choices[first + k - 1] for k in range(len(some))]
                         other = _there_and_back(config, episodes, others, first, True)
                     made = _truth_metrics(batch, other, measures)
                 else:
@@ -177,12 +169,6 @@ def mirror_test(
         floor=joined(TRUTH, "floor"),
         pairs={method: joined(method, "pair") for method in everyone if method != TRUTH},
     )
-
-
-def _digest(measures: Mapping[str, Revisit]) -> str:
-    """Return a hash of the metrics that compare both visits."""
-    content = [VERSION, [[n, getattr(m.compare, "sha256", "")] for n, m in measures.items()]]
-    return inputs_hash(content)[:12]
 
 
 def _there_and_back(
@@ -236,11 +222,9 @@ def _model_metrics(
 
 def facts(mirror: Mirror) -> dict[str, Any]:
     """Return the results for ``metrics.json``; ``docs/evaluation.md`` describes them."""
-    houses = mirror.scored.clusters
     own, truth = own_method(mirror.pairs), mirror.values[TRUTH]
 
-    def entries(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        return {name: intervals.entry(values, houses) for name, values in arrays.items()}
+    entries = functools.partial(statistics.entries, houses_C=mirror.scored.clusters)
 
     def minus(method: str) -> dict[str, np.ndarray]:
         return {name: mirror.pairs[own][name] - mirror.pairs[method][name] for name in PAIRS}

@@ -15,7 +15,7 @@ from pewm_jax.eval.clips import choose, load_clip, needs_cameras, stack
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.runner import ModelRunner, print_now
 from pewm_jax.io import atomic
-from pewm_jax.report.pictures import as_bytes, farthest, grid, save_png
+from pewm_jax.report.pictures import after_present, farthest, grid, save_png
 from pewm_jax.report.video import encode_h264, side_by_side
 from pewm_jax.train.watch import IMAGINED, Preview, Previewed
 from pewm_jax.types import Frames, Params
@@ -33,17 +33,12 @@ def make_preview(
     Previews are optional: without validation data, or if it is too short, a line is logged and no
     previews are made.
 
-    Args:
-        config: the experiment; clips come from ``data.path``/validation.
-        run: the run's folder; images and videos go to its folder ``previews/``.
-        log: prints the reason if there are no previews.
-
     Returns:
         ``preview(params, stage, step)``. It imagines the clips with the current weights and
         measures their PSNR with its map and with an empty map, or, in a stage without memory (such
-        as PEWM's stage 1), of the model without a map. It writes ``previews/stage2-000250.png``
-        with the rows ground truth, with its map, empty map, and ``previews/stage2-000250.mp4``, the
-        same side by side. It is compiled once per stage.
+        as PEWM's stage 1), of the model without a map. It writes ``previews/stage2-000250.png`` in
+        the run's folder with the rows ground truth, with its map, empty map, and
+        ``previews/stage2-000250.mp4``, the same side by side. It is compiled once per stage.
     """
     quick = dataclasses.replace(config.evaluate, split=SPLIT, batch=CLIPS)
     config = dataclasses.replace(config, evaluate=quick)
@@ -71,74 +66,40 @@ def make_preview(
             _, _, imagined[name] = models[stage.name].run(
                 context, control, seeds, memory=memory, params=params
             )
-        name = f"{stage.name}-{step:06d}"
-        shown = clips[:SHOWN]
-        picture = _picture(shown, imagined, f"{stage.title}, step {step}")
-        return Previewed(
-            (
-                save_png(run / "previews" / f"{name}.png", picture),
-                _save_video(run / "previews" / f"{name}.mp4", shown, imagined, f"step {step}"),
-            ),
-            {name: _score(clips, frames) for name, frames in imagined.items()},
-        )
+        file = run / "previews" / f"{stage.name}-{step:06d}.png"
+        shown = [_columns(clip, imagined, index) for index, clip in enumerate(clips[:SHOWN])]
+        times = ["observed", *(str(index + 1) for index in range(len(shown[0][0][1]) - 1))]
+        rows = [(name, list(rgb)) for columns in shown for name, rgb, _ in columns]
+        save_png(file, grid(rows, times, title=f"{stage.title}, step {step}", cell=96))
+        pictures = []
+        for index, columns in enumerate(shown):
+            where = f"step {step}, clip {index + 1} of {len(shown)}"
+            footers = [
+                f"{where}: {f'imagined {time}' if at else time}" for at, time in enumerate(times)
+            ]
+            far_m = farthest(clips[index][1])
+            pictures += side_by_side(columns, footers, far_m=far_m, cell=192)
+        video = file.with_suffix(".mp4")
+        with atomic.replacing(video) as partial:
+            partial.write_bytes(encode_h264(pictures))
+        psnrs = {name: _score(clips, frames) for name, frames in imagined.items()}
+        return Previewed((file, video), psnrs)
 
     return preview
 
 
-_Loaded = tuple[Frames, Frames, Any]
-"""Context, ground-truth frames and control of a clip, as returned by ``load_clip``."""
-
-
-def _score(clips: Sequence[_Loaded], frames: Frames) -> float:
+def _score(clips: Sequence[tuple[Frames, Frames, Any]], frames: Frames) -> float:
     """Return the mean PSNR in dB over frames and clips (B, N)."""
     truth = np.stack([true.rgb_THWC for _, true, _ in clips])
     difference = unit_colours(frames.rgb_THWC[: len(clips)]) - unit_colours(truth)
     return float(psnr((difference**2).mean((2, 3, 4))).mean())
 
 
-def _picture(clips: Sequence[_Loaded], imagined: Mapping[str, Frames], title: str) -> np.ndarray:
-    """Arrange the frames of every clip: a row for the ground truth and a row for each variant."""
-    rows = []
-    for index, (seen, true, _) in enumerate(clips):
-        present = seen.rgb_THWC[-1]
-        rows.append(("truth", [present, *true.rgb_THWC]))
-        rows += [
-            (IMAGINED[name], [present, *as_bytes(frames.rgb_THWC[index])])
-            for name, frames in imagined.items()
-        ]
-    count = len(clips[0][1].depth_THW)
-    columns = ["observed", *(f"{index + 1}" for index in range(count))]
-    return grid(rows, columns, title=title, cell=96)
-
-
-def _save_video(
-    path: Path, clips: Sequence[_Loaded], imagined: Mapping[str, Frames], title: str
-) -> Path:
-    """Write a video atomically: one clip after another, ground truth and variants side by side."""
-    pictures = []
-    for index, (seen, true, _) in enumerate(clips):
-        columns = [
-            (name, _with_present(seen, rgb), _with_present_depth(seen, depth))
-            for name, rgb, depth in (
-                ("truth", true.rgb_THWC, true.depth_THW),
-                *(
-                    (IMAGINED[name], as_bytes(frames.rgb_THWC[index]), frames.depth_THW[index])
-                    for name, frames in imagined.items()
-                ),
-            )
-        ]
-        times = range(len(true.depth_THW) + 1)
-        where = f"{title}, clip {index + 1} of {len(clips)}"
-        footers = [f"{where}: {f'imagined {time}' if time else 'observed'}" for time in times]
-        pictures += side_by_side(columns, footers, far_m=farthest(true), cell=192)
-    with atomic.replacing(path) as partial:
-        partial.write_bytes(encode_h264(pictures))
-    return path
-
-
-def _with_present(seen: Frames, rgb_THWC: np.ndarray) -> np.ndarray:
-    return np.concatenate([seen.rgb_THWC[-1:], rgb_THWC])
-
-
-def _with_present_depth(seen: Frames, depth_THW: np.ndarray) -> np.ndarray:
-    return np.concatenate([seen.depth_THW[-1:], np.asarray(depth_THW, np.float32)])
+def _columns(
+    clip: tuple[Frames, Frames, Any], imagined: Mapping[str, Frames], index: int
+) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return caption, colours and depth of a clip's ground truth and of each variant."""
+    seen, true, _ = clip
+    made = [("truth", true.rgb_THWC, true.depth_THW)]
+    made += [(IMAGINED[n], x.rgb_THWC[index], x.depth_THW[index]) for n, x in imagined.items()]
+    return [(name, *after_present(seen, rgb, depth)) for name, rgb, depth in made]

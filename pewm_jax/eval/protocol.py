@@ -41,15 +41,11 @@ class EpisodeKey:
 
 @dataclasses.dataclass(frozen=True)
 class ClipKey:
-    """A clip to imagine.
+    """A clip to imagine: the present frame, the frames observed and those to imagine.
 
-    Attributes:
-        episode: index in ``Protocol.episodes``.
-        start: the present frame.
-        context: frames observed, oldest first, the present last.
-        targets: frames to imagine.
-        motion_sha256: hash of the recorded poses at the start and the targets, and of the actions
-            recorded between them.
+    ``episode`` is the index in ``Protocol.episodes``, the last of ``context`` the present frame;
+    ``motion_sha256`` hashes the recorded poses at the start and the targets, and the actions
+    recorded between them.
     """
 
     episode: int
@@ -65,17 +61,13 @@ class Protocol:
 
     Attributes:
         split: name of the split's folder.
-        height: image height, pixels.
-        width: image width, pixels.
         context: number of frames observed before each clip.
         stride: number of recorded actions between two imagined frames.
         horizon: number of frames imagined from each start.
         long_horizon: likewise for long rollouts.
         seeds: seeds of the sampling noise; long rollouts use the first.
         control: ``actions`` or ``cameras``, which drive the model.
-        episodes: the episodes of the clips.
         clips: the scored clips, in the order that determines their noise.
-        rollouts: the long rollouts.
         noise: how noise is derived from a seed.
         scoring: version of the scoring rules.
     """
@@ -117,10 +109,6 @@ def choose_clips(
 ) -> tuple[list[ClipChoice], list[ClipChoice]]:
     """Choose clips and long rollouts by the settings, on the return path of every episode.
 
-    Args:
-        config: the clip length, ``data.context`` and ``evaluate`` are used.
-        episodes: held-out episodes.
-
     Raises:
         UserError: no episode is long enough.
     """
@@ -146,12 +134,6 @@ def make_protocol(
     rollouts: Sequence[ClipChoice],
 ) -> Protocol:
     """Return the protocol of chosen clips and long rollouts.
-
-    Args:
-        config: the image size, ``data.context`` and ``evaluate`` are used.
-        episodes: held-out episodes.
-        clips: the scored clips.
-        rollouts: the long rollouts.
 
     Raises:
         UserError: the episodes have another image size than the clip's.
@@ -208,15 +190,9 @@ def motion_hash(episode: Episode, choice: ClipChoice) -> str:
 def find_clips(
     protocol: Protocol, episodes: Sequence[Episode], where: str
 ) -> tuple[list[ClipChoice], list[ClipChoice]]:
-    """Find a protocol's clips in a data set, which may contain other episodes, in any order.
+    """Find a protocol's clips and long rollouts in a data set.
 
-    Args:
-        protocol: the protocol.
-        episodes: the data set.
-        where: its name in error messages.
-
-    Returns:
-        ``(clips, rollouts)``.
+    The data set, named ``where`` in error messages, may contain other episodes, in any order.
 
     Raises:
         UserError: an episode is missing, or its content has changed.
@@ -249,14 +225,7 @@ def resolve_clips(
 ) -> tuple[Protocol, list[ClipChoice], list[ClipChoice]]:
     """Return the protocol, its clips and its long rollouts: fixed, or chosen by the settings.
 
-    Args:
-        config: the experiment, with the settings of the fixed protocol.
-        episodes: the data set.
-        fixed: a protocol from a file, or None.
-        where: the data set's name in error messages.
-
-    Raises:
-        UserError: as ``find_clips``, ``choose_clips`` and ``make_protocol``.
+    Errors are those of ``find_clips``, ``choose_clips`` and ``make_protocol``.
     """
     if fixed is not None:
         return fixed, *find_clips(fixed, episodes, where)
@@ -324,14 +293,9 @@ FIXED = ("clips", "seeds", "chain", "stride", "video_clips")
 def apply_protocol_file(
     config: Config, changes: Mapping[str, Any]
 ) -> tuple[Config, Protocol | None]:
-    """Return the settings with those of their protocol file applied, and the protocol.
+    """Return the settings with those of their protocol file applied, and the protocol or None.
 
-    Args:
-        config: the run's configuration, with overrides for the evaluation.
-        changes: these overrides; None values are ignored.
-
-    Returns:
-        The unchanged settings and None, if they name no file.
+    ``changes`` are the overrides given for the evaluation; None values are ignored.
 
     Raises:
         UserError: the file cannot be used, the model does not fit it, or an override changes a
@@ -358,12 +322,6 @@ def write_protocol(config: Config, path: Path, log: Callable[[str], Any]) -> Pro
     """Choose clips by an experiment's settings and write them to a file, before training.
 
     A file with the same protocol is not changed.
-
-    Args:
-        config: clip size and length, ``data.path``, ``data.context`` and
-            ``evaluate`` are used.
-        path: the file.
-        log: prints a line.
 
     Raises:
         UserError: the data are missing or too short, or the file contains another protocol.
@@ -395,13 +353,7 @@ def write_protocol(config: Config, path: Path, log: Callable[[str], Any]) -> Pro
 
 
 def save_protocol(path: Path, protocol: Protocol, notes: dict[str, Any]) -> None:
-    """Write a protocol file; its folder is created.
-
-    Args:
-        path: the file.
-        protocol: the protocol.
-        notes: notes that are not hashed, such as the location of the data.
-    """
+    """Write a protocol file with notes that are not hashed; its folder is created."""
     value = {
         "format": FORMAT,
         "version": FILE_VERSION,
@@ -440,8 +392,7 @@ def load_protocol(path: Path) -> Protocol:
         raise UserError(
             f"the protocol {path} has versions {versions[0]} (file) and {versions[1]} (scoring), "
             f"this library's are {FILE_VERSION} and {VERSION}; write it again, and evaluate every "
-            "run "
-            "with the new one."
+            "run with the new one."
         )
     if hash_of(content) != value.get("sha256"):
         raise UserError(

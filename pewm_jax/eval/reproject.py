@@ -27,7 +27,6 @@ from pewm_jax.geometry.cameras import unproject
 from pewm_jax.geometry.depth_images import normals
 from pewm_jax.io.store import ResultCache, file_hash, inputs_hash
 from pewm_jax.memory import rendering
-from pewm_jax.memory import rendering as views
 from pewm_jax.types import Array, Camera, Clip, Frames, View
 
 
@@ -79,19 +78,12 @@ CANDIDATES = (
 
 
 def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> Frames:
-    """Render observed frames from other cameras.
+    """Render S observed frames from N other cameras, of images of the same size.
 
-    Args:
-        settings: rendering settings (static under jit).
-        context: S observed frames, colours uint8 or float in [−1, 1]; pixels without depth, such as
-            those of padding frames, are ignored.
-        camera: (N,) cameras of images of the context's size.
-
-    Returns:
-        N frames, colours float32 in [−1, 1], depth in metres. An image without any observed point
-        is black and has no depth.
+    Colours are float32 in [−1, 1]. Pixels without depth, such as those of padding frames, are
+    ignored. An image without any observed point is black and has no depth.
     """
-    view = views.fill_nearest(draw(settings, context, camera))
+    view = rendering.fill_nearest(draw(settings, context, camera))
     return Frames(2 * view.features_THWF - 1, view.depth_THW, camera)
 
 
@@ -104,32 +96,16 @@ def draw(settings: ReprojectSettings, context: Frames, camera: Camera) -> View:
     there = (depth_SHW > 0).reshape(-1)
     if settings.average or settings.footprint > 1 or not settings.backs:
         focal = jnp.asarray(context.camera.intrinsics_4)[:, 0, None, None]
-        return rendering.splat_surfels(
-            points,
-            colours,
-            settings.width * (depth_SHW / focal).reshape(-1),
-            there,
-            camera,
-            height,
-            width,
-            most=settings.footprint,
-            average=settings.average,
-            normals_V3=None
-            if settings.backs
-            else normals(depth_SHW, context.camera).reshape(-1, 3),
-        )
+        sizes = settings.width * (depth_SHW / focal).reshape(-1)
+        facing = None if settings.backs else normals(depth_SHW, context.camera).reshape(-1, 3)
+        how = {"most": settings.footprint, "average": settings.average, "normals_V3": facing}
+        return rendering.splat_surfels(points, colours, sizes, there, camera, height, width, **how)
     return rendering.splat(points, colours, there, camera, height, width)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def reproject_batch(settings: ReprojectSettings, context: Frames, camera: Camera) -> Frames:
-    """Render B clips in sequence, because the data of one clip fits a CPU cache.
-
-    Args:
-        settings: as for ``reproject``.
-        context: (B, S) observed frames.
-        camera: (B, N) cameras.
-    """
+    """Render B clips in sequence, because the data of one clip fits a CPU cache."""
 
     def one(clip: tuple[Frames, Camera]) -> tuple[Array, Array]:
         frames = reproject(settings, *clip)
@@ -147,14 +123,12 @@ VERSION = 1
 
 @dataclasses.dataclass(frozen=True)
 class ReprojectChoice:
-    """The chosen settings, and the reason.
+    """The chosen settings, and the reason as a sentence.
 
     Attributes:
-        settings: the chosen settings.
         scores: the name of each candidate → mean PSNR over all pixels of the clips, dB; empty if
             none could be tried.
         clips: number of clips they were tried on.
-        why: the reason, as a sentence.
         data: sha256 of the index of the validation split; "" if there is none.
     """
 
@@ -193,11 +167,6 @@ def choose_settings(
     Clips are cut as in training, the same at every call: one from each episode, then a second one,
     and so on. Scores are stored in ``cache``. Without a validation split whose clips fit the model,
     the default settings are used.
-
-    Args:
-        config: the experiment.
-        cache: where scores are stored.
-        log: prints a line.
     """
     folder, data = Path(config.data.path) / SPLIT, data_hash(config)
     try:
@@ -239,11 +208,7 @@ def _piece(config: Config, data: str) -> str:
 
 
 def _cut(config: Config, episodes: EpisodeSource) -> Clip:
-    """Cut at most ``CLIPS`` clips as in training, in a fixed order.
-
-    Raises:
-        UserError: there is no clip, or the frames have another size than the model's.
-    """
+    """Cut at most ``CLIPS`` clips as in training, in a fixed order; raise if there is none."""
     rng, cut = np.random.default_rng(0), []
     size = (config.model.clip.height, config.model.clip.width)
     for turn in range(CLIPS if len(episodes) else 0):

@@ -9,10 +9,11 @@ and metric, under a name such as ``clips/memory/seen/psnr``; NaN if a clip has n
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,10 @@ import jax
 import numpy as np
 
 from pewm_jax.config import Config, UserError, to_dict
-from pewm_jax.eval import intervals, mirror, statistics
-from pewm_jax.eval.clips import ClipChoice
+from pewm_jax.eval import mirror, statistics
 from pewm_jax.eval.long_rollouts import LongRollouts
 from pewm_jax.eval.metrics import VideoDistance
 from pewm_jax.eval.metrics.structure import Consistency
-from pewm_jax.eval.metrics.videos import DISTANCES
 from pewm_jax.eval.mirror import Mirror
 from pewm_jax.eval.scoring import TRUTH, Scored
 from pewm_jax.eval.statistics import scores
@@ -54,9 +53,9 @@ def compute_metrics(
         ``margin``, the one over ``empty`` (None for a model without a memory);
         ``per_frame[method][mask][metric]``; ``long`` with the same for long rollouts,
         ``drift[method]`` (see ``statistics.drift``) and ``growth``, the size of the map;
-        ``houses``, means over houses with 95 % intervals (see ``intervals.table``), with the same
-        for long rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, the mirror test (see
-        ``mirror.facts``); ``scs``, see ``structure``; None for what was not measured.
+        ``houses``, means over houses with 95 % intervals (``statistics.house_table``),
+        with the same for long rollouts in ``long``; ``videos``, FVD and KVD; ``mirror``, see
+        ``mirror.facts``; ``scs``, see ``structure``; None for what was not measured.
     """
     return {
         "schema": SCHEMA,
@@ -71,10 +70,10 @@ def compute_metrics(
         "mirror": mirror.facts(back) if back else None,
         "scs": structure(config, scored, consistency) if consistency else None,
         "houses": {
-            "how": intervals.how(),
+            "how": statistics.interval_facts(),
             "house": scored.clustered_by,
-            **intervals.table(scored.sums, scored.clusters),
-            "long": intervals.table(long.scored.sums, long.scored.clusters),
+            **statistics.house_table(scored.sums, scored.clusters),
+            "long": statistics.house_table(long.scored.sums, long.scored.clusters),
         },
     }
 
@@ -98,42 +97,36 @@ def growth(config: Config, long: LongRollouts) -> dict[str, Any] | None:
     clusters = long.scored.clusters
     return {
         "frames": [each * clip for clip in range(long.chain + 1)],
-        "occupied": intervals.entry(held, clusters),
-        "per_frame": intervals.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
+        "occupied": statistics.entry(held, clusters),
+        "per_frame": statistics.entry((held[:, -1] - held[:, 0]) / (each * long.chain), clusters),
         "capacity": config.model.facts.room or None,
     }
 
 
 def structure(config: Config, scored: Scored, consistency: Consistency) -> dict[str, Any]:
     """Return SCS of every method and its ceiling, over houses; see ``docs/evaluation.md``."""
-
-    def entry(values: np.ndarray) -> dict[str, Any]:
-        return intervals.entry(values, scored.clusters)
-
+    entries = functools.partial(statistics.entries, houses_C=scored.clusters)
     values = {method: scs for method, scs in scored.structure.items() if method != TRUTH}
     truth, own = scored.structure[TRUTH], values[own_method(values)]
     return {
         "name": consistency.name,
         "seed": config.evaluate.seeds[0],
         "clips": int(np.isfinite(truth[:, 0]).sum()),
-        "results": {method: entry(scs[:, 0]) for method, scs in values.items()},
-        "per_frame": {method: entry(scs[:, 1:]) for method, scs in values.items()},
-        "ceiling": entry(truth[:, 0]),
-        "ceiling_per_frame": entry(truth[:, 1:]),
-        "margins": {
-            method: entry(own[:, 0] - scs[:, 0]) for method, scs in values.items() if scs is not own
-        },
+        "results": entries({method: scs[:, 0] for method, scs in values.items()}),
+        "per_frame": entries({method: scs[:, 1:] for method, scs in values.items()}),
+        **entries({"ceiling": truth[:, 0], "ceiling_per_frame": truth[:, 1:]}),
+        "margins": entries(
+            {method: own[:, 0] - scs[:, 0] for method, scs in values.items() if scs is not own}
+        ),
     }
 
 
 def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any] | None:
     """Return FVD and KVD of every method with their floors; None for fewer than two clips."""
-    features = dict(scored.features)
-    truth, clips = features.pop(TRUTH), len(scored.choices)
+    clips, frames = len(scored.choices), len(scored.choices[0].targets_N) + 1
     if clips < 2:
         return None
-    frames = len(scored.choices[0].targets_N) + 1
-    kinds_of = {kind: dataclasses.replace(i3d, kind=kind) for kind in DISTANCES}
+    kinds_of, truth = i3d.kinds(), scored.features[TRUTH]
     return {
         "frames": frames,
         "clips": clips,
@@ -141,7 +134,8 @@ def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any]
         "names": {kind: metric.name(frames, clips) for kind, metric in kinds_of.items()},
         "results": {
             method: {kind: metric.score(found, truth).facts() for kind, metric in kinds_of.items()}
-            for method, found in features.items()
+            for method, found in scored.features.items()
+            if method != TRUTH
         },
     }
 
@@ -151,6 +145,10 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
     clip, choices, own = config.model.clip, scored.choices, own_method(scored.sums)
     remembers = own == "memory"
     scenes = sorted({choice.scene for choice in choices + long.scored.choices})
+    try:
+        version = metadata.version("pewm-jax")
+    except metadata.PackageNotFoundError:
+        version = "not installed"
     return {
         "scenes": len(scenes),
         "episodes": len({choice.episode for choice in choices}),
@@ -195,7 +193,7 @@ def protocol_of(config: Config, scored: Scored, long: LongRollouts) -> dict[str,
             "seed": config.evaluate.seeds[0],
             "shown": long.shown,
         },
-        "versions": {"pewm_jax": _version(), "jax": jax.__version__},
+        "versions": {"pewm_jax": version, "jax": jax.__version__},
         "scene_names": scenes,
         "clip_list": [[choice.name, choice.start] for choice in choices],
         "config": to_dict(config),
@@ -216,13 +214,6 @@ def _memory_of(config: Config, *, remembers: bool) -> dict[str, Any]:
     }
 
 
-def _version() -> str:
-    try:
-        return metadata.version("pewm-jax")
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
 SAMPLES, SAMPLES_VERSION = "samples.npz", 1
 PARTS = ("clips", "frames", "rollouts")
 """Parts of the scores: whole clips, (seeds, clips); their frames, (seeds, clips, horizon); and the
@@ -231,13 +222,10 @@ frames of long rollouts, (1, rollouts, long horizon)."""
 
 @dataclasses.dataclass(frozen=True)
 class Samples:
-    """The content of ``samples.npz``.
+    """The content of ``samples.npz``: the scores by name, and what they are of.
 
-    Attributes:
-        about: ``version``, ``protocol_sha256``, ``weights_sha256``, ``lpips_weights_sha256``,
-            ``seeds``, ``clustered_by``, and ``clips`` and ``rollouts``: name, scene and start of
-            each.
-        arrays: the scores by name.
+    ``about`` has ``version``, ``protocol_sha256``, ``weights_sha256``, ``lpips_weights_sha256``,
+    ``seeds``, ``clustered_by``, and ``clips`` and ``rollouts``: name, scene and start of each.
     """
 
     about: Mapping[str, Any]
@@ -264,28 +252,19 @@ class Samples:
 
 
 def gather_samples(scored: Scored, long: LongRollouts, **facts: Any) -> Samples:
-    """Return the scores of every clip, frame and long rollout.
-
-    Args:
-        scored: errors of the clips.
-        long: errors of the long rollouts.
-        facts: the hashes and seeds of ``Samples.about``.
-    """
+    """Return the scores of every clip, frame and long rollout, with ``facts`` in ``about``."""
     arrays = {}
     for method, sums_SCT39 in scored.sums.items():
-        arrays |= _score_arrays("clips", method, sums_SCT39.sum(2)) | _score_arrays(
-            "frames", method, sums_SCT39
-        )
+        arrays |= _score_arrays("clips", method, sums_SCT39.sum(2))
+        arrays |= _score_arrays("frames", method, sums_SCT39)
     for method, sums_SCT39 in long.scored.sums.items():
         arrays |= _score_arrays("rollouts", method, sums_SCT39)
-    about = {
-        "version": SAMPLES_VERSION,
-        **facts,
-        "clustered_by": scored.clustered_by,
-        "clips": _choice_rows(scored.choices),
-        "rollouts": _choice_rows(long.scored.choices),
-    }
-    return Samples(about, arrays)
+    clips, rollouts = (
+        [[choice.name, choice.scene, choice.start] for choice in each.choices]
+        for each in (scored, long.scored)
+    )
+    about = {"version": SAMPLES_VERSION, **facts, "clustered_by": scored.clustered_by}
+    return Samples(about | {"clips": clips, "rollouts": rollouts}, arrays)
 
 
 def _score_arrays(part: str, method: str, sums: np.ndarray) -> dict[str, np.ndarray]:
@@ -294,10 +273,6 @@ def _score_arrays(part: str, method: str, sums: np.ndarray) -> dict[str, np.ndar
         for mask, by_metric in scores(sums).items()
         for metric, values in by_metric.items()
     }
-
-
-def _choice_rows(choices: Sequence[ClipChoice]) -> list[list[Any]]:
-    return [[choice.name, choice.scene, choice.start] for choice in choices]
 
 
 def save_samples(folder: Path, samples: Samples) -> None:

@@ -215,9 +215,7 @@ class ModelRunner:
 def mesh_of(devices: Sequence[Any], batch: int) -> Mesh | None:
     """Return the mesh over which a batch is split, or None for JAX's default device.
 
-    Args:
-        devices: devices of this process.
-        batch: number of clips; split equally, so some devices may be unused.
+    The batch is split equally, so some devices may be unused.
     """
     count = max((n for n in range(1, len(devices) + 1) if batch % n == 0), default=1)
     if count < 2:
@@ -251,15 +249,7 @@ SAMPLED = ("memory", "empty", "model", "none")
 
 @dataclasses.dataclass(frozen=True)
 class Methods:
-    """The methods of one evaluation.
-
-    Attributes:
-        model: the evaluated model.
-        reproject: settings of the reprojection.
-        none: a model trained without a memory, or None.
-        none_weights: hash of the weights of ``none``.
-        remembers: whether the evaluated model has a memory.
-    """
+    """The methods of one evaluation; ``none`` is a model trained without a memory."""
 
     model: ModelRunner
     reproject: ReprojectSettings
@@ -273,11 +263,6 @@ class Methods:
         left_out = {"model"} if self.remembers else {"memory", "empty"}
         left_out |= {"none"} if self.none is None else set()
         return tuple(name for name in METHODS if name not in left_out)
-
-    @property
-    def own(self) -> str:
-        """Return the method of the model itself: ``memory``, or ``model`` if it has none."""
-        return "memory" if self.remembers else "model"
 
     def piece(self, method: str) -> str:
         """Return the method's name in partial results, which includes what its scores depend on."""
@@ -305,19 +290,10 @@ class Methods:
         seeds_B2: np.ndarray,
         watch: Callable[[Any], Any] | None = None,
     ) -> tuple[Any, Any, Frames]:
-        """Imagine N frames for every clip of a batch.
+        """Imagine N frames for every clip of a batch by one of ``names``; see ``ModelRunner.run``.
 
-        Args:
-            method: one of ``names``.
-            context: (B, S) observed frames, the present last, colours uint8.
-            control: control of the model, see ``ModelRunner.run``.
-            camera: (B, N) cameras of the frames to imagine, according to the control.
-            seeds_B2: sampling seed and clip number.
-            watch: for networks, see ``ModelRunner.run``.
-
-        Returns:
-            ``(first, last, frames)``: the states before and after, None for methods without a
-            network, and (B, N) frames.
+        ``camera`` are the (B, N) cameras of the frames, according to the control. Methods without a
+        network have no states before and after: None.
 
         Raises:
             UserError: the model's output is not finite.

@@ -7,17 +7,25 @@ A unit of work is one batch of clips, one method and one sampling seed. Its resu
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pewm_jax.config import Config
+from pewm_jax import worlds
+from pewm_jax.config import Config, World
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.clips import ClipChoice, choose, load_clip, stack
 from pewm_jax.eval.metrics import LPIPS, VideoDistance
-from pewm_jax.eval.metrics.images import error_sums_batch, unit_colours, with_lpips
+from pewm_jax.eval.metrics.images import (
+    error_sums_batch,
+    seen_masks_batch,
+    unit_colours,
+    with_lpips,
+)
 from pewm_jax.eval.metrics.structure import (
     Consistency,
     average,
@@ -25,11 +33,10 @@ from pewm_jax.eval.metrics.structure import (
     object_ids,
     object_masks,
 )
-from pewm_jax.eval.runner import SAMPLED, Methods, print_now, workers
-from pewm_jax.eval.seen import seen_masks_batch
+from pewm_jax.eval.runner import SAMPLED, Methods, ModelRunner, print_now, workers
 from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import ResultCache, map_resumable
-from pewm_jax.types import Array, Frames
+from pewm_jax.types import Array, Frames, Params, WorldState
 
 TRUTH = "truth"
 """Pseudo-method for the recorded clips, which are measured like a method."""
@@ -68,10 +75,10 @@ class Scored:
 
 @dataclasses.dataclass(frozen=True)
 class Tracked:
-    """Ground truth of a clip for SCS.
+    """Ground truth of a clip for SCS, of its present frame and the N frames to imagine.
 
     Attributes:
-        ids_THW: (T, H, W) instance ids of the present frame and the N frames to imagine.
+        ids_THW: instance ids.
         things: ids of the objects that may be tracked, or None for all.
         visible_T: (T,) bool, whether each frame shows a point that the present frame shows.
     """
@@ -81,12 +88,7 @@ class Tracked:
     visible_T: np.ndarray
 
     def score(self, measure: Consistency, video_THWC: np.ndarray) -> np.ndarray:
-        """Return (T,) values: SCS of a clip, then of each of its frames but the first.
-
-        Args:
-            measure: SCS with a segmenter.
-            video_THWC: (T, H, W, 3) uint8, the present frame and the N imagined ones.
-        """
+        """Return (T,) values: SCS of a uint8 clip, then of each of its frames but the first."""
         found = measure(video_THWC, object_masks(self.ids_THW, self.things), self.visible_T)
         return np.concatenate([average(found)[None], average(found, 0)])
 
@@ -158,13 +160,7 @@ def load_batch(
 ) -> Batch:
     """Read a batch of clips starting at index ``first``, with their seen-before masks.
 
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        choices: the clips.
-        first: index of the first clip.
-        cameras: see ``load_clip``.
-        track: whether to read the instance ids, for SCS.
+    With ``track`` the instance ids are read, for SCS.
 
     Raises:
         UserError: see ``load_clip``; or ids are requested and an episode has none.
@@ -189,14 +185,10 @@ def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
 
 @dataclasses.dataclass(frozen=True)
 class Piece:
-    """A unit of work: one batch of clips, one method, one seed, one kind of measurement.
+    """A unit of work: one batch of clips, one method (or ``truth``), one seed, one measurement.
 
-    Attributes:
-        method: one of ``Methods.names``, or ``truth``.
-        seed: seed of the sampling noise.
-        first: index of the batch's first clip.
-        measured: ``sums`` of the errors, ``features`` for the distances of videos, or ``structure``
-            for SCS.
+    ``first`` is the index of the batch's first clip; ``measured`` is ``sums`` of the errors,
+    ``features`` for the distances of videos, or ``structure`` for SCS.
     """
 
     method: str
@@ -234,22 +226,11 @@ def score_table(
     """Score ``evaluate.clips`` chains of ``evaluate.chain`` clips by method and seed.
 
     Results in ``cache`` are reused. Several processes share the work, and all return the whole
-    table.
-
-    Args:
-        config: the experiment.
-        episodes: held-out episodes.
-        methods: the methods.
-        cache: where results are stored.
-        log: prints a line.
-        lpips: LPIPS; None to skip it.
-        choices: the clips; by default those of ``choose``.
-        i3d: the network of FVD; None to skip the features of whole clips.
-        structure: SCS; None to skip it.
+    table. What is None is not measured; without ``choices`` the clips are those of ``choose``.
 
     Raises:
-        UserError: no episode is long enough, the data is inconsistent or does not fit the model,
-            or the model's output is not finite.
+        UserError: no episode is long enough, the data is inconsistent or does not fit the model, or
+            the model's output is not finite.
     """
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
@@ -260,23 +241,22 @@ def score_table(
         methods.prepare(piece.method for piece in todo)
         frames_each = config.evaluate.chain * (config.model.clip.frames - 1)
         total = sum(frames_each * min(size, len(choices) - piece.first) for piece in todo)
-        loaded: tuple[int, Batch] | None = None
-        made: tuple[tuple[int, str, int], Any] | None = None
+        cameras, track = methods.model.cameras, structure is not None
+
+        @functools.lru_cache(1)
+        def load(first: int) -> Batch:
+            some = choices[first : first + size]
+            return load_batch(config, episodes, some, first, cameras=cameras, track=track)
+
+        @functools.lru_cache(1)
+        def imagine(first: int, method: str, seed: int) -> Frames:
+            batch = load(first)
+            return batch.targets if method == TRUTH else batch.imagine(methods, method, seed)[2]
+
         with Meter("scoring", total, "frames") as meter:
             for piece in todo:
-                if loaded is None or loaded[0] != piece.first:
-                    some = choices[piece.first : piece.first + size]
-                    cameras, track = methods.model.cameras, structure is not None
-                    batch = load_batch(
-                        config, episodes, some, piece.first, cameras=cameras, track=track
-                    )
-                    loaded = piece.first, batch
-                batch = loaded[1]
-                if piece.method == TRUTH:
-                    made = piece.rollout, batch.targets
-                elif made is None or made[0] != piece.rollout:
-                    made = piece.rollout, batch.imagine(methods, piece.method, piece.seed)[2]
-                yield piece, _measure(piece, batch, made[1], lpips, i3d, structure)
+                batch, frames = load(piece.first), imagine(*piece.rollout)
+                yield piece, _measure(piece, batch, frames, lpips, i3d, structure)
                 meter.advance(frames_each * batch.real)
         log(meter.summary())
 
@@ -335,3 +315,65 @@ def _measure(
         return {"structure": batch.structure(frames, structure)}
     assert i3d is not None
     return {"features": i3d.features(batch.whole(frames.rgb_THWC))[: batch.real]}
+
+
+COVERAGE = ("seen", "held", "chosen", "attended", "rendered", "looked_at")
+"""The keys of ``World.coverage``, in the order in which they are stored."""
+
+
+def score_coverage(
+    config: Config,
+    episodes: Sequence[Episode],
+    model: ModelRunner,
+    cache: ResultCache,
+    log: Callable[[str], Any],
+    choices: Sequence[ClipChoice],
+) -> dict[str, float] | None:
+    """Measure how much of the pixels seen before the memory covers in the first clip of each chain.
+
+    Results are stored in ``cache``. Returns shares of these pixels: ``held``, ``chosen``,
+    ``attended``, ``rendered``, ``looked_at`` (see ``memory.coverage.coverage``); None if no pixel
+    was seen before. Errors are those of ``score_table``.
+    """
+    starts = range(0, len(choices), config.evaluate.batch)
+
+    def work(todo: list[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        log("measuring the coverage of the map …")
+        for first in todo:
+            some = choices[first : first + config.evaluate.batch]
+            batch = load_batch(config, episodes, some, first, cameras=model.cameras)
+            yield first, {"counts": _count(config.model, model, batch)}
+
+    found = map_resumable(
+        starts,
+        lambda first: f"coverage2-clip{first:04d}",
+        work,
+        cache=cache,
+        what="coverage",
+        workers=workers(),
+    )
+    counts = [found[first]["counts"].sum(0) for first in starts]
+    total = dict(zip(COVERAGE, np.sum(counts, 0).astype(float), strict=True))
+    seen = total.pop("seen")
+    return {name: count / seen for name, count in total.items()} if seen else None
+
+
+def _count(config: World, model: ModelRunner, batch: Batch) -> np.ndarray:
+    """Return (clips, 6) pixels, in the order of ``COVERAGE``."""
+    state, length = model.begin(batch.context), config.clip.frames - 1
+    targets, seen = jax.tree.map(lambda x: x[:, :length], (batch.targets, batch.seen))
+    present = jax.tree.map(lambda x: x[:, -1:], batch.context)
+    frames = jax.tree.map(lambda a, b: np.concatenate([a, b], 1), present, targets)
+    seen = np.concatenate([np.zeros_like(seen[:, :1]), seen], 1)  # the present is not imagined
+    counted = _coverage_of_clips(config, model.params, state, frames, seen)
+    return np.stack([counted[name] for name in COVERAGE], -1)[: batch.real]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _coverage_of_clips(
+    model: World, params: Params, states: WorldState, frames: Frames, seen: Array
+) -> dict[str, Array]:
+    def one(clip: tuple[WorldState, Frames, Array]) -> dict[str, Array]:
+        return worlds.coverage(model, params, *clip)
+
+    return jax.lax.map(one, jax.tree.map(jnp.asarray, (states, frames, seen)))

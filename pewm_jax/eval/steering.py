@@ -24,7 +24,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval import intervals
+from pewm_jax.eval import statistics
 from pewm_jax.eval.clips import ClipChoice, choice_of, load_clip, return_start, stack
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.runner import workers
@@ -49,12 +49,8 @@ APART = 0.5
 class Walks:
     """Clips that are walks, each with a clip of another house that has different actions.
 
-    Attributes:
-        choices: the C clips to imagine.
-        others: (C,) clips that provide the shuffled actions.
-        forward_C: (C,) share of each clip's steps that go forward, at least ``LEAST_FORWARD``.
-        different_C: (C,) share of the steps in which the shuffled actions differ from the true
-            ones, at least ``LEAST_DIFFERENT``.
+    ``forward_C`` is the share of each clip's steps that go forward, ``different_C`` the share in
+    which the shuffled actions, of ``others``, differ from the true ones.
 
     Raises:
         ValueError: a share is below its limit, or both clips of a pair are from one house.
@@ -95,14 +91,10 @@ class Walks:
 
 
 def forward_steps(actions: ActionConfig, motion_N3: np.ndarray) -> np.ndarray:
-    """Return (...) bool: whether steps go forward.
+    """Return (...) bool: whether steps (..., 3) dx, dy, dyaw, metres and radians, go forward.
 
     A step goes forward if the agent moves ahead by more than it turns, in units of a forward step
     and of a turn. So a discrete forward action does, and a discrete turn does not.
-
-    Args:
-        actions: the units.
-        motion_N3: (..., 3) dx, dy, dyaw; metres and radians.
     """
     motion = np.asarray(motion_N3)
     ahead = motion[..., 0] / actions.step_m
@@ -111,13 +103,7 @@ def forward_steps(actions: ActionConfig, motion_N3: np.ndarray) -> np.ndarray:
 
 
 def different_steps(actions: ActionConfig, one_N3: np.ndarray, two_N3: np.ndarray) -> np.ndarray:
-    """Return (...) bool: whether two motions differ, by half of a step or half of a turn.
-
-    Args:
-        actions: the units.
-        one_N3: (..., 3) dx, dy, dyaw; metres and radians.
-        two_N3: the same.
-    """
+    """Return (...) bool: whether two motions differ, by half of a step or half of a turn."""
     apart = np.abs(np.asarray(one_N3) - np.asarray(two_N3))
     turned = np.minimum(apart[..., 2], 2 * math.pi - apart[..., 2]) / math.radians(actions.turn_deg)
     return np.maximum(apart[..., :2].max(-1) / actions.step_m, turned) >= APART
@@ -133,18 +119,10 @@ def choose_walks(
     """Choose clips that are walks, and the clips that provide the shuffled actions.
 
     Starts are spread evenly over the walks on the return path of every episode, where reports take
-    their clips too. The shuffled actions are drawn, with a fixed seed, from all clips on the return
-    paths in other houses that differ in ``LEAST_DIFFERENT`` of the steps; these need not be walks.
-
-    Args:
-        config: ``clip.frames``, ``actions``, ``data.context`` and ``evaluate.stride`` are used.
-        episodes: held-out episodes.
-        clips: largest number of clips.
-        chain: number of consecutive clips from each start.
-        among: indices of the episodes to choose from; by default all.
-
-    Returns:
-        The first walk of every episode, then the second ones, and so on.
+    their clips too: the first walk of every episode, then the second ones, and so on. The shuffled
+    actions are drawn, with a fixed seed, from all clips on the return paths in other houses that
+    differ in ``LEAST_DIFFERENT`` of the steps; these need not be walks. ``among`` are the indices
+    of the episodes to choose from; by default all.
 
     Raises:
         UserError: no episode is long enough, none has a walk, or no other house has different
@@ -217,12 +195,7 @@ def _motion(world_from_camera: np.ndarray, stride: int) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True)
 class Steered:
-    """The results of the measurement.
-
-    Attributes:
-        errors: kind of actions → (C, N) mean squared colour errors of each imagined frame.
-        walks: the C clips.
-    """
+    """The results: kind of actions → (C, N) mean squared colour errors of each imagined frame."""
 
     errors: Mapping[str, np.ndarray]
     walks: Walks
@@ -251,13 +224,8 @@ class Steered:
         }
 
     def _entries(self, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-        each = {name: intervals.entry(found, self.walks.houses) for name, found in values.items()}
-        more = {
-            f"{TRUE} - {name}": intervals.entry(values[TRUE] - found, self.walks.houses)
-            for name, found in values.items()
-            if name != TRUE
-        }
-        return {**each, **more}
+        gains = {f"{TRUE} - {n}": values[TRUE] - x for n, x in values.items() if n != TRUE}
+        return statistics.entries({**values, **gains}, self.walks.houses)
 
     def lines(self) -> list[str]:
         """Return the table as text."""
@@ -272,14 +240,7 @@ class Steered:
 def measure(
     config: Config, params: Params, episodes: Sequence[Episode], clips: int, *, seed: int = 0
 ) -> Steered:
-    """Imagine walks with true, shuffled and no actions, all with the same noise.
-
-    Args:
-        config: an experiment whose model is controlled by actions.
-        params: its weights.
-        episodes: held-out episodes with actions.
-        clips: largest number of clips (``choose_walks``).
-        seed: seed of the sampling noise.
+    """Imagine at most ``clips`` walks with true, shuffled and no actions, all with the same noise.
 
     Raises:
         UserError: the episodes are too short, have no walks, or are all from one house.
@@ -303,18 +264,9 @@ def score(
 ) -> tuple[Steered | None, str | None]:
     """Measure steering for a report; resumable, and shared among processes.
 
-    Args:
-        config: the experiment.
-        params: its weights.
-        episodes: held-out episodes.
-        choices: the report's clips; equally many walks are chosen from the same episodes.
-        cache: where results are stored.
-        log: prints a line.
-
-    Returns:
-        The results and a description of the clips. If the episodes have no walks in two houses, the
-        results are None and the description gives the reason; both are None if the model is not
-        controlled by actions.
+    As many walks as the report has clips are chosen from the same episodes. Returns the results and
+    a description of the clips. If the episodes have no walks in two houses, the results are None
+    and the description gives the reason; both are None if the model is not controlled by actions.
     """
     if not config.model.capabilities.silent_actions:
         return None, None

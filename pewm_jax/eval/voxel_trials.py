@@ -53,7 +53,6 @@ class Trials:
         within: number of frames in which a block was in the window that may change.
         frames: number of frames of all walks with a block.
         asked: number of walks, with or without room for a block.
-        persistence_logit: ``model.persistence_logit``, nats.
     """
 
     kept_N: np.ndarray
@@ -101,12 +100,7 @@ def room(model: PERSIST, state: WorldState, floor_z: float) -> np.ndarray | None
 
 
 def block_class(config: Config, walks: Sequence[RecordedWalk], name: str = "") -> int:
-    """Return the id of the class that blocks are made of.
-
-    Args:
-        config: an experiment of a ``persist`` world.
-        walks: one for each trial.
-        name: name of the class; by default the first kind of furniture.
+    """Return the id of the class that blocks are made of: by default the first kind of furniture.
 
     Raises:
         UserError: the walks have no voxels, or there is no such class.
@@ -129,17 +123,9 @@ def run(
 ) -> Trials:
     """Run the trials: place a block, imagine the walk, and measure persistence and visibility.
 
-    Args:
-        config: an experiment of a ``persist`` world.
-        params: its weights.
-        walks: one for each trial, of equal length, with voxels.
-        name: class of the blocks; see ``block_class``.
-        batch: number of walks imagined at once.
-        chunk: number of frames imagined per call.
-        count: number of trials after which to stop; None for all walks.
-
-    Raises:
-        UserError: see ``block_class``.
+    There is a trial for each of the walks with voxels, of equal length, until there are ``count``.
+    ``name`` is the class of the blocks and may raise, see ``block_class``. ``batch`` walks are
+    imagined at once, ``chunk`` frames per call.
     """
     model: PERSIST = config.model
     number = block_class(config, walks, name)
@@ -193,9 +179,8 @@ def run(
 def block_visibility(there_hw: np.ndarray, change_HW: np.ndarray) -> tuple[bool, bool]:
     """Return whether a block is visible, and whether the image changed more there.
 
-    Args:
-        there_hw: bool, rays that hit the block first.
-        change_HW: difference of pixels from the same walk without the block.
+    ``there_hw`` are the rays that hit the block first, ``change_HW`` the difference of pixels from
+    the same walk without the block.
     """
     rows, columns = (
         np.arange(size) * rays // size
@@ -226,12 +211,7 @@ def _cells(model: PERSIST, grid: ClassGrid, box_23: np.ndarray, number: int) -> 
 def _rays_on_block(
     model: PERSIST, grid: ClassGrid, camera: Any, box_23: Any
 ) -> tuple[Array, Array]:
-    """Return which rays first hit a cell of a box, and whether the window contains such a cell.
-
-    Returns:
-        (rows, columns) bool, and () bool: whether a part of the box is in the window around the
-        camera.
-    """
+    """Return which rays first hit a cell of a box, and whether the window contains such a cell."""
     place = camera.world_from_camera[0, :3, 3]
     first = windows.first_cell(model, grid.low_3, place)
     marked = class_grid.place(model.memory, grid, box_23, 1)
@@ -268,16 +248,10 @@ def reconstruction_shares(
 ) -> dict[str, float]:
     """Return the shares of cells whose class the autoencoder reconstructs.
 
-    Args:
-        model: the world.
-        params: its parameters.
-        grids: (T, X, Y, Z) class ids of each walk's frames, 0 where there is nothing; grids larger
-            than the autoencoder's are cropped at the centre.
-
-    Returns:
-        ``grids``: number of grids evaluated; ``occupied``: share of occupied cells reconstructed
-        with their class; ``filled``: share of occupied cells reconstructed as occupied; ``empty``:
-        share of empty cells reconstructed as empty.
+    ``grids`` are (T, X, Y, Z) class ids of each walk's frames, 0 where there is nothing; grids
+    larger than the autoencoder's are cropped at the centre. Returns ``grids``, the number of grids
+    evaluated; of the occupied cells the shares ``occupied`` (with their class) and ``filled`` (as
+    occupied); and ``empty``, that of empty cells.
     """
     config = model.backbone.voxel_vae  # type: ignore[attr-defined]
     again = jax.jit(functools.partial(_reconstruct, config))

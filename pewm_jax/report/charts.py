@@ -9,8 +9,8 @@ from __future__ import annotations
 import dataclasses
 import io
 import math
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -32,6 +32,9 @@ DOTS_PER_INCH = 200
 BAND_OPACITY = 0.16
 MARKED = 16
 """Largest number of points for which a curve has markers."""
+OFFSET: dict[str, Any] = {"xytext": (6, 0), "textcoords": "offset points"}
+BESIDE = {**OFFSET, "va": "center", "fontsize": 8}
+"""How a text is placed to the right of a point."""
 LABEL_GAP = 0.045
 """Smallest distance between the labels of two curves, as a fraction of the height."""
 
@@ -72,12 +75,8 @@ class Chart(Protocol):
 class Line:
     """A curve with a band around it.
 
-    Attributes:
-        name: label at its end.
-        colour: any matplotlib colour.
-        values: one per position, None if missing.
-        low: the lower edge of the band, None where there is none; empty for no band.
-        high: its upper edge.
+    Values and edges of the band are one per position, None where there is none; ``name`` is the
+    label at its end.
     """
 
     name: str
@@ -96,14 +95,17 @@ class Line:
         high = [None if v is None else v + (e or 0) for v, e in pairs]
         return cls(name, colour, values, low, high)
 
+    @classmethod
+    def with_interval(cls, name: str, colour: str, entry: Mapping[str, Any]) -> Line:
+        """Return the curve ``mean`` with the band from ``low`` to ``high``."""
+        return cls(name, colour, entry["mean"], entry["low"], entry["high"])
+
 
 @dataclasses.dataclass(frozen=True)
 class LineChart:
     """Curves over positions.
 
     Attributes:
-        title: the title.
-        x_label: label of the horizontal axis.
         lines: the curves, with one value per position.
         x: the positions; 1, 2, 3, … by default.
         unit: unit of the values, shown in the title.
@@ -132,24 +134,13 @@ class LineChart:
         x = list(self.x or range(1, count + 1))
         for line in reversed(self.lines):  # the first one on top
             marker = "o" if sum(value is not None for value in line.values) <= MARKED else ""
-            axes.plot(
-                x,
-                _numbers(line.values),
-                color=line.colour,
-                linewidth=1.6,
-                marker=marker,
-                markersize=3,
-            )
+            style = {"color": line.colour, "linewidth": 1.6, "marker": marker, "markersize": 3}
+            axes.plot(x, _numbers(line.values), **style)
             if line.low:
                 low, high = _band(line)
                 axes.fill_between(x, low, high, color=line.colour, alpha=BAND_OPACITY, linewidth=0)
-        axes.set_title(
-            f"{self.title}, {self.unit}" if self.unit else self.title,
-            loc="left",
-            fontsize=9,
-            fontweight="bold",
-            color=theme.ink,
-        )
+        title = f"{self.title}, {self.unit}" if self.unit else self.title
+        axes.set_title(title, loc="left", fontsize=9, fontweight="bold", color=theme.ink)
         axes.set_xlabel(self.x_label, fontsize=8, color=theme.quiet)
         axes.grid(axis="y", color=theme.line, linewidth=0.6)
         axes.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
@@ -177,13 +168,7 @@ class IntervalRow:
 
 @dataclasses.dataclass(frozen=True)
 class IntervalChart:
-    """Means with their intervals, stacked vertically.
-
-    Attributes:
-        title: the title.
-        caption: a line below the title.
-        rows: the rows, from top to bottom.
-    """
+    """Means with their intervals, stacked vertically from top to bottom."""
 
     title: str
     caption: str
@@ -204,23 +189,9 @@ class IntervalChart:
             high = item.mean if item.high is None else item.high
             axes.plot([low, high], [place, place], color=colour, linewidth=2)
             axes.plot([item.mean], [place], color=colour, marker="o", markersize=6)
-            axes.plot(
-                item.dots,
-                [place + 0.28] * len(item.dots),
-                color=colour,
-                marker="o",
-                markersize=2.5,
-                linestyle="",
-            )
-            axes.annotate(
-                f"{item.mean:.2f}",
-                (high, place),
-                xytext=(6, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-                color=theme.ink,
-            )
+            below = [place + 0.28] * len(item.dots)
+            axes.plot(item.dots, below, color=colour, marker="o", markersize=2.5, linestyle="")
+            axes.annotate(f"{item.mean:.2f}", (high, place), color=theme.ink, **BESIDE)
         axes.set_yticks(range(len(self.rows)), [item.label for item in self.rows], fontsize=8)
         axes.tick_params(axis="y", labelcolor=theme.ink)
         axes.set_ylim(len(self.rows) - 0.4, -0.6)
@@ -271,13 +242,5 @@ def _label_lines(axes: Axes, lines: Sequence[Line], x: Sequence[float]) -> None:
     place = -math.inf
     for value, line in sorted(ends, key=lambda end: end[0]):
         place = max(value, place + LABEL_GAP * (top - bottom))
-        axes.annotate(
-            line.name,
-            (x[-1], place),
-            xytext=(6, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-            color=line.colour,
-            annotation_clip=False,
-        )
+        end = (x[-1], place)
+        axes.annotate(line.name, end, color=line.colour, annotation_clip=False, **BESIDE)

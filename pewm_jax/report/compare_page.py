@@ -41,13 +41,8 @@ NOT_COMPARED = (
 def side_by_side(long_horizon: int, one: Path, two: Path) -> list[np.ndarray]:
     """Draw the long rollouts shown in both reports: ground truth, first run, second run.
 
-    Args:
-        long_horizon: imagined frames of a long rollout.
-        one: folder of the first one's report.
-        two: folder of the second one's.
-
-    Returns:
-        An image for each rollout whose frames both reports have.
+    Returns an image for each rollout, of ``long_horizon`` imagined frames, whose images both
+    reports' folders have.
     """
     steps = picture_steps(long_horizon)
     names = ["observed" if step == 0 else f"step {step}" for step in steps]
@@ -76,24 +71,16 @@ def _own(report: Path, index: int) -> Path:
 
 
 def sentences(content: Mapping[str, Any]) -> list[str]:
-    """Return the sentences of the comparison, for the page and the terminal.
-
-    Args:
-        content: content of ``comparison.json``.
-    """
+    """Return the sentences of ``comparison.json``, for the page and the terminal."""
     a, b = (content[side]["name"] for side in ("a", "b"))
-    return [
-        f"Over pixels {MASK_NAMES[mask]}: {outcome(content['differences']['clips'][mask], a, b)}"
-        if mask != "all"
-        else f"Over all pixels: {outcome(content['differences']['clips'][mask], a, b)}"
-        for mask in MASK_NAMES
-    ] + [*_same_weights(content), *_samplers(content)]
-
-
-def _same_weights(content: Mapping[str, Any]) -> list[str]:
-    """Return a sentence if both runs have the same weights."""
+    where = {mask: f"pixels {name}" for mask, name in MASK_NAMES.items()} | {"all": "all pixels"}
+    said = [
+        f"Over {words}: {outcome(content['differences']['clips'][mask], a, b)}"
+        for mask, words in where.items()
+    ]
     hashes = [{run["weights_sha256"] for run in content[side]["runs"]} for side in ("a", "b")]
-    return ["a and b are the same weights."] if hashes[0] == hashes[1] else []
+    said += ["a and b are the same weights."] if hashes[0] == hashes[1] else []
+    return said + _samplers(content)
 
 
 def _samplers(content: Mapping[str, Any]) -> list[str]:
@@ -111,10 +98,7 @@ def _samplers(content: Mapping[str, Any]) -> list[str]:
 def outcome(entries: Mapping[str, Any], one: str, two: str) -> str:
     """Return the second part of a sentence that says whether the first run's PSNR is higher.
 
-    Args:
-        entries: ``[metric]`` of first − second.
-        one: name of the first.
-        two: name of the second.
+    ``entries`` are ``[metric]`` of first − second.
     """
     found = entries["psnr"]
     if found["mean"] is None:
@@ -133,33 +117,20 @@ def outcome(entries: Mapping[str, Any], one: str, two: str) -> str:
 
 
 def comparison_page(content: Mapping[str, Any], pictures: Sequence[np.ndarray]) -> str:
-    """Return the page as HTML.
-
-    Args:
-        content: content of ``comparison.json``.
-        pictures: images of ``side_by_side``.
-    """
+    """Return the page as HTML."""
     first, *others = sentences(content)
     title = "\n".join(f"{side}: {content[side]['name']}" for side in ("a", "b"))
     opening = [Text(INTRODUCTION, "quiet"), Text(first, "lead"), Bullets(others)]
-    sections = [
-        _stills(pictures),
-        _scores(content),
-        _seeds(content),
-        _horizon(content),
-        _houses(content),
-        _protocol(content),
-    ]
-    return render(title, opening, sections)
+    parts = (_scores, _seeds, _horizon, _houses, _protocol)
+    return render(title, opening, [_stills(pictures), *(part(content) for part in parts)])
 
 
 def _stills(pictures: Sequence[np.ndarray]) -> Section:
     if not pictures:
-        return Section("", [Text("The two reports have no frames in common to show.", "quiet")])
+        return Section.of_note("The two reports have no frames in common to show.")
     text = (
         "Long rollouts, the first of the protocol (not selected): ground truth, then each model "
-        "(with "
-        "its map, if it has one), which continues from its own last frame."
+        "(with its map, if it has one), which continues from its own last frame."
     )
     figures = [Figure(png(picture), alt="truth, a, b") for picture in pictures]
     return Section("Side by side", [Text(text), *figures])
@@ -175,13 +146,12 @@ def _scores(content: Mapping[str, Any]) -> Section:
             cells = [with_interval(entries.get(m), METRIC_NAMES[m][1], sign=gain) for m in measured]
             rows.append(row(label, *cells, str(entries["psnr"]["houses"]), highlight=gain))
     heads = ["", *(heading(name, content) for name in measured), "houses"]
+    reasons = dict.fromkeys(content["left_out"], "the two were measured with different networks")
+    for name in content["measured_by_one"]:
+        reasons.setdefault(name, "only one of the two was measured with it")
     left = "".join(
-        f" {METRIC_NAMES[name][0]} is omitted: the two were measured with different networks."
-        for name in content["left_out"]
-    )
-    left += "".join(
-        f" {METRIC_NAMES[name][0]} is omitted: only one of the two was measured with it."
-        for name in content["measured_by_one"]
+        f" {METRIC_NAMES[name][0]} is omitted: {why}."
+        for name, why in reasons.items()
         if name in METRIC_NAMES
     )
     note = (
@@ -189,7 +159,7 @@ def _scores(content: Mapping[str, Any]) -> Section:
         "first; in brackets the 95 % interval of a bootstrap over houses. A difference is clear "
         f"if its interval does not contain 0. {NOT_COMPARED}{left}"
     )
-    return Section("Scores", [TableBlock(Table(heads, rows)), Text(note, "quiet")])
+    return Section.of_table("Scores", heads, rows, note)
 
 
 def _seeds(content: Mapping[str, Any]) -> Section:
@@ -200,7 +170,7 @@ def _seeds(content: Mapping[str, Any]) -> Section:
             "Each model was trained once, so the effect of the training seed is not measured "
             "(add more seeds with `--also_a` and `--also_b`)."
         )
-        return Section("", [Text(note, "quiet")])
+        return Section.of_note(note)
     rows: list[Row] = []
     for mask, name in MASK_NAMES.items():
         rows.append(heading_row(name))
@@ -215,12 +185,11 @@ def _seeds(content: Mapping[str, Any]) -> Section:
         rows.append(row("a − b", "", with_interval(found, 2, sign=True), highlight=True))
     note = (
         "In brackets Student's 95 % interval over training seeds: the variation between trainings, "
-        "in "
-        "these houses. It does not cover other houses, and the interval over houses does not "
+        "in these houses. It does not cover other houses, and the interval over houses does not "
         "cover other trainings."
     )
-    table = Table(["PSNR, dB", "seed: mean over houses", "over seeds"], rows)
-    return Section("Training seeds", [TableBlock(table), Text(note, "quiet")])
+    heads = ["PSNR, dB", "seed: mean over houses", "over seeds"]
+    return Section.of_table("Training seeds", heads, rows, note)
 
 
 def _horizon(content: Mapping[str, Any]) -> Section:
@@ -229,18 +198,17 @@ def _horizon(content: Mapping[str, Any]) -> Section:
         for mask in ("seen", "unseen"):
             where = MASK_NAMES[mask]
             for title, sides in (("PSNR", ("a", "b")), ("a − b", ("differences",))):
-                lines = [_line(content, side, part, mask) for side in sides]
+                found = {side: content[side][part][mask]["psnr"] for side in sides}
+                lines = [
+                    Line.with_interval(NAMES[side], COLOURS[side], entry)
+                    for side, entry in found.items()
+                ]
                 charts.append(
                     LineChart(f"{long}{title}, {where}", "imagined frame", lines, unit="dB")
                 )
     legend = {NAMES[side]: colour for side, colour in COLOURS.items()}
     note = "Bands are the 95 % intervals over houses, frame by frame."
     return Section("By horizon", [Charts(charts, legend), Text(note, "quiet")])
-
-
-def _line(content: Mapping[str, Any], side: str, part: str, mask: str) -> Line:
-    found = content[side][part][mask]["psnr"]
-    return Line(NAMES[side], COLOURS[side], found["mean"], found["low"], found["high"])
 
 
 def _houses(content: Mapping[str, Any]) -> Section:

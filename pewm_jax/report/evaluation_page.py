@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from pewm_jax.report.labels import (
     METRIC_NAMES,
     RIVALS,
     heading,
+    labelled,
     own_method,
     summary_lines,
 )
@@ -84,12 +85,9 @@ class Gallery:
         videos: (caption, MP4) of each long rollout.
         strip: frames of one rollout in rows: ground truth, with its map, empty map, reprojected;
             for a model without a memory one row instead of two.
-        strip_note: which rollout and which frames they are.
         moving: all frames of that rollout side by side, a GIF.
         masks: the same ground-truth frames with never-seen pixels greyed out.
-        masks_note: what counts as seen before.
         above: the map from above, before and after that rollout; None without a memory.
-        above_note: what is omitted in it.
         rows: for each rollout shown, the frames of ``truth`` and of each method at the steps of
             ``strip``, side by side in one image and at full size.
     """
@@ -106,33 +104,20 @@ class Gallery:
 
 
 def evaluation_page(metrics: Mapping[str, Any], gallery: Gallery) -> str:
-    """Return the page as HTML.
-
-    Args:
-        metrics: the content of ``metrics.json``.
-        gallery: images and videos.
-    """
+    """Return the page of ``metrics.json``, with images and videos, as HTML."""
     first, *others = summary_lines(metrics)
-    opening = [
-        Text(introduction(metrics["protocol"]), "quiet"),
-        Text(first, "lead"),
-        Bullets(others),
-    ]
-    sections = [
-        _rollouts(gallery),
-        scores(metrics),
-        houses(metrics),
-        steering(metrics),
-        structure(metrics),
-        videos(metrics),
-        _frame_by_frame(metrics),
-        drift(metrics),
-        growth(metrics),
-        mirror(metrics),
-        coverage(metrics),
-        _map(gallery),
-        _protocol(metrics["protocol"]),
-    ]
+    introduced = Text(introduction(metrics["protocol"]), "quiet")
+    opening = [introduced, Text(first, "lead"), Bullets(others)]
+    above = None
+    if gallery.above is not None:
+        figure = Figure(png(gallery.above), alt="the map from above", caption=gallery.above_note)
+        above = Section("The map, from above", [figure])
+    measured = (
+        *(scores, houses, steering, structure, videos),
+        *(_frame_by_frame, drift, growth, mirror, coverage),
+    )
+    sections = [_rollouts(gallery), *(part(metrics) for part in measured), above]
+    sections.append(_protocol(metrics["protocol"]))
     return render(TITLES[own_method(metrics["results"])], opening, sections)
 
 
@@ -173,9 +158,8 @@ def scores(metrics: Mapping[str, Any]) -> Section:
     rows = []
     for mask, name in MASK_NAMES.items():
         rows.append(heading_row(name))
-        for method, label in METHOD_NAMES.items():
-            if method in metrics["results"]:
-                rows.append(line(label, metrics["results"][method][mask]))
+        for method, label in labelled(metrics["results"]):
+            rows.append(line(label, metrics["results"][method][mask]))
         for method in RIVALS:
             if method in metrics["margins"]:
                 label = f"{MINUS[own]} minus {METHOD_NAMES[method]}"
@@ -194,7 +178,7 @@ def scores(metrics: Mapping[str, Any]) -> Section:
         f"the error is {CLUSTERS[metrics['protocol']['clustered_by']]}. Differences are taken clip "
         f"by clip, among models with the same noise.{gain}"
     )
-    return Section("Scores", [TableBlock(Table(["", *heads, "clips"], rows)), Text(note, "quiet")])
+    return Section.of_table("Scores", ["", *heads, "clips"], rows, note)
 
 
 def houses(metrics: Mapping[str, Any]) -> Section:
@@ -205,17 +189,12 @@ def houses(metrics: Mapping[str, Any]) -> Section:
     ends = sorted({0, (frames - 1) // 2, frames - 1})
     for mask, name in MASK_NAMES.items():
         rows.append(heading_row(name))
-        for part, steps, gain in (
-            ("results", "per_frame", False),
-            ("margins", "per_frame_margins", True),
-        ):
-            for method, label in METHOD_NAMES.items():
-                if method not in found[part]:
-                    continue
+        for part, gain in (("results", False), ("margins", True)):
+            steps = "per_frame_margins" if gain else "per_frame"
+            for method, label in labelled(found[part]):
                 whole = found[part][method][mask]["psnr"]
-                cells = _whole_and_frames(
-                    whole, found[steps][method][mask]["psnr"], ends, 2, sign=gain
-                )
+                by_frame = found[steps][method][mask]["psnr"]
+                cells = _whole_and_frames(whole, by_frame, ends, 2, sign=gain)
                 shown = f"{minus} minus {label}" if gain else label
                 rows.append(row(shown, *cells, str(whole["houses"]), highlight=gain))
     heads = ["PSNR, dB", "all frames", *(f"frame {t + 1}" for t in ends), f"{found['house']}s"]
@@ -225,7 +204,7 @@ def houses(metrics: Mapping[str, Any]) -> Section:
         f"({found['how']['draws']} draws). Differences are paired. These numbers are of one "
         "training; to measure how much the training seed matters, use `pewm-jax compare --also_a`."
     )
-    return Section("House by house", [TableBlock(Table(heads, rows)), Text(note, "quiet")])
+    return Section.of_table("House by house", heads, rows, note)
 
 
 def _whole_and_frames(
@@ -262,13 +241,11 @@ def steering(metrics: Mapping[str, Any]) -> Section | None:
     note = (
         f"{found['clips']} walks with the same noise: {100 * found['forward']:.0f} % of their "
         "steps go forward. Another clip's actions are those of a clip in another house; they "
-        "differ in "
-        f"{100 * found['different']:.0f} % of the steps. Means over houses, in brackets the "
-        "interval of a bootstrap over them. A world that follows its actions is closest to the "
+        f"differ in {100 * found['different']:.0f} % of the steps. Means over houses, in brackets "
+        "the interval of a bootstrap over them. A world that follows its actions is closest to the "
         "ground truth with the true ones."
     )
-    blocks = [TableBlock(Table(heads, rows)), Text(note, "quiet")]
-    return Section("Do the actions steer the model?", blocks)
+    return Section.of_table("Do the actions steer the model?", heads, rows, note)
 
 
 def structure(metrics: Mapping[str, Any]) -> Section | None:
@@ -277,16 +254,15 @@ def structure(metrics: Mapping[str, Any]) -> Section | None:
     if not found:
         return None
     ends = [0, len(found["ceiling_per_frame"]["mean"]) - 1]
-
-    def line(label: str, whole: Mapping[str, Any], steps: Mapping[str, Any]) -> Row:
-        return row(label, *_whole_and_frames(whole, steps, ends, 1), str(whole["houses"]))
-
+    entries = {
+        label: (found["results"][method], found["per_frame"][method])
+        for method, label in labelled(found["results"])
+    }
+    entries["the true clip"] = found["ceiling"], found["ceiling_per_frame"]
     rows = [
-        line(label, found["results"][method], found["per_frame"][method])
-        for method, label in METHOD_NAMES.items()
-        if method in found["results"]
+        row(label, *_whole_and_frames(whole, steps, ends, 1), str(whole["houses"]))
+        for label, (whole, steps) in entries.items()
     ]
-    rows.append(line("the true clip", found["ceiling"], found["ceiling_per_frame"]))
     heads = [found["name"], "all frames", *(f"frame {t + 1}" for t in ends), "houses"]
     note = (
         "Structural consistency score: 100 × IoU of the masks of objects in the imagined and the "
@@ -296,27 +272,18 @@ def structure(metrics: Mapping[str, Any]) -> Section | None:
         f"{found['clips']} clips, first sampling seed; means over houses, in brackets the interval "
         "of a bootstrap over them."
     )
-    blocks = [TableBlock(Table(heads, rows)), Text(note, "quiet")]
-    return Section("Are objects where they should be?", blocks)
+    return Section.of_table("Are objects where they should be?", heads, rows, note)
 
 
 def videos(metrics: Mapping[str, Any]) -> Section:
     """Return FVD and KVD with their floors, or the reason why they were not measured."""
     found = metrics["videos"]
     if not found:
-        return Section("", [Text(metrics["protocol"]["fvd"], "quiet")])
-    rows = [
-        row(
-            label,
-            *(
-                cell
-                for name in found["names"]
-                for cell in _distance(found["results"][method][name])
-            ),
-        )
-        for method, label in METHOD_NAMES.items()
-        if method in found["results"]
-    ]
+        return Section.of_note(metrics["protocol"]["fvd"])
+    rows = []
+    for method, label in labelled(found["results"]):
+        entries = [found["results"][method][name] for name in found["names"]]
+        rows.append(row(label, *(cell for entry in entries for cell in _distance(entry))))
     heads = [
         head for name in found["names"].values() for head in (f"{name} ↓", "halves", "their floor")
     ]
@@ -327,16 +294,13 @@ def videos(metrics: Mapping[str, Any]) -> Section:
         "the floor compares the truth of the same halves (mean ± standard deviation over random "
         "halves). The closer the two, the less imagined and true clips can be told apart."
     )
-    blocks = [TableBlock(Table(["", *heads], rows)), Text(note, "quiet")]
-    return Section("Videos as a whole", blocks)
+    return Section.of_table("Videos as a whole", ["", *heads], rows, note)
 
 
 def _distance(entry: Mapping[str, Any]) -> list[str]:
-    halves = [
-        "–" if entry[name] is None else f"{entry[name]['mean']:.4g} ± {entry[name]['std']:.2g}"
-        for name in ("half", "floor")
-    ]
-    return [f"{entry['value']:.4g}", *halves]
+    halves = (entry["half"], entry["floor"])
+    shown = ("–" if x is None else f"{x['mean']:.4g} ± {x['std']:.2g}" for x in halves)
+    return [f"{entry['value']:.4g}", *shown]
 
 
 def _frame_by_frame(metrics: Mapping[str, Any]) -> Section:
@@ -358,19 +322,15 @@ def _frame_by_frame(metrics: Mapping[str, Any]) -> Section:
     return Section("Frame by frame", [Charts(charts, legend(clips)), Text(note, "quiet")])
 
 
-def legend(methods: Iterable[str]) -> dict[str, str]:
+def legend(methods: Collection[str]) -> dict[str, str]:
     """Return the colours of some methods by their names, in the order of the tables."""
-    known = set(methods)
-    return {
-        label: METHOD_COLOURS[method] for method, label in METHOD_NAMES.items() if method in known
-    }
+    return {label: METHOD_COLOURS[method] for method, label in labelled(methods)}
 
 
 def _error_lines(per_frame: Mapping[str, Any], mask: str, metric: str) -> list[Line]:
     return [
         Line.with_errors(label, METHOD_COLOURS[method], points["mean"], points["stderr"])
-        for method, label in METHOD_NAMES.items()
-        if method in per_frame
+        for method, label in labelled(per_frame)
         for points in [per_frame[method][mask][metric]]
     ]
 
@@ -380,9 +340,7 @@ def drift(metrics: Mapping[str, Any]) -> Section:
     rows = [
         row(
             METHOD_NAMES[method],
-            *(with_error(each, 2) for each in entry["quarters"]),
-            with_error(entry["first16"], 2),
-            with_error(entry["last16"], 2),
+            *(with_error(x, 2) for x in (*entry["quarters"], entry["first16"], entry["last16"])),
             with_error(entry["difference"], 2, sign=True),
         )
         for method, entry in metrics["long"]["drift"].items()
@@ -390,7 +348,7 @@ def drift(metrics: Mapping[str, Any]) -> Section:
     heads = ["", *QUARTERS, "first 16 frames", "last 16", "difference"]
     frames = metrics["protocol"]["long_rollouts"]["frames_each"]
     text = f"PSNR over pixels seen before, dB, along rollouts of {frames} frames."
-    return Section("Drift", [Text(text), TableBlock(Table(heads, rows))])
+    return Section.of_table("Drift", heads, rows, text=text)
 
 
 def growth(metrics: Mapping[str, Any]) -> Section | None:
@@ -416,7 +374,7 @@ def mirror(metrics: Mapping[str, Any]) -> Section:
     """Return the mirror test, or the reason why it was skipped."""
     found = metrics["mirror"]
     if not found:
-        return Section("", [Text(metrics["protocol"]["mirror"], "quiet")])
+        return Section.of_note(metrics["protocol"]["mirror"])
     methods = list(found["results"])
     charts = [
         LineChart(
@@ -459,9 +417,7 @@ def mirror(metrics: Mapping[str, Any]) -> Section:
 
 
 def _interval_line(method: str, entry: Mapping[str, Any]) -> Line:
-    return Line(
-        METHOD_NAMES[method], METHOD_COLOURS[method], entry["mean"], entry["low"], entry["high"]
-    )
+    return Line.with_interval(METHOD_NAMES[method], METHOD_COLOURS[method], entry)
 
 
 def coverage(metrics: Mapping[str, Any]) -> Section | None:
@@ -470,15 +426,8 @@ def coverage(metrics: Mapping[str, Any]) -> Section | None:
     if not shares:
         return None
     rows = [row(label, f"{100 * shares[key]:.1f} %") for key, label in COVERAGE_NAMES.items()]
-    text = Text("Share of the pixels seen before whose surface is")
-    return Section("What the map covers", [text, TableBlock(Table(["", "share"], rows))])
-
-
-def _map(gallery: Gallery) -> Section | None:
-    if gallery.above is None:
-        return None
-    figure = Figure(png(gallery.above), alt="the map from above", caption=gallery.above_note)
-    return Section("The map, from above", [figure])
+    text = "Share of the pixels seen before whose surface is"
+    return Section.of_table("What the map covers", ["", "share"], rows, text=text)
 
 
 def _protocol(protocol: Mapping[str, Any]) -> Section:

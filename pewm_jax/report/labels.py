@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from pewm_jax.report.table import Table, with_error, with_interval
@@ -64,8 +64,7 @@ ACTIONS_NAMES = {
 NONE_HOW = (
     "There is no row for a model trained equally long without a memory: train one with the same "
     "clip, codec and number of steps, all in stage 1 (--train.stage1.steps N --train.stage2.steps "
-    "0), "
-    "and give its folder by --none."
+    "0), and give its folder by --none."
 )
 NONE_LACKING = (
     "There is no row for a model trained equally long without a memory: give the folder of one "
@@ -79,13 +78,13 @@ def own_method(names: Iterable[str]) -> str:
     return next(name for name in OWN_METHODS if name in found)
 
 
-def heading(metric: str, protocol: Mapping[str, Any]) -> str:
-    """Return a metric's heading: LPIPS with the name of its network.
+def labelled(methods: Collection[str]) -> list[tuple[str, str]]:
+    """Return some methods with their labels, in the order of the tables."""
+    return [(method, label) for method, label in METHOD_NAMES.items() if method in methods]
 
-    Args:
-        metric: key of ``METRIC_NAMES``.
-        protocol: entry ``protocol`` of ``metrics.json``.
-    """
+
+def heading(metric: str, protocol: Mapping[str, Any]) -> str:
+    """Return a metric's heading, for LPIPS with its network; ``protocol`` is a report's entry."""
     text, network = METRIC_NAMES[metric][0], protocol.get("lpips_name")
     return text.replace("LPIPS", network) if network else text
 
@@ -122,17 +121,10 @@ def format_verdict(entry: Mapping[str, Any], where: str) -> str:
 def format_comparison(margin: Mapping[str, Any], rival: str, own: str = "memory") -> str:
     """Return a sentence that compares the model with another method, per mask.
 
-    Args:
-        margin: ``[mask]["psnr"]`` of the model minus the rival.
-        rival: key of ``RIVALS``.
-        own: key of ``OWN_NAMES``.
+    ``margin`` is ``[mask]["psnr"]`` of the model minus the rival, a key of ``RIVALS``.
     """
-    masks = {
-        "seen": "over pixels seen before",
-        "unseen": "over those never seen",
-        "all": "over all",
-    }
-    said = [f"{where} {_outcome(margin[mask]['psnr'])}" for mask, where in masks.items()]
+    masks = {"seen": "pixels seen before", "unseen": "those never seen", "all": "all"}
+    said = [f"over {where} {_outcome(margin[mask]['psnr'])}" for mask, where in masks.items()]
     return f"{OWN_NAMES[own]} against {RIVALS[rival]}: {'; '.join(said)}."
 
 
@@ -149,11 +141,7 @@ def _outcome(entry: Mapping[str, Any]) -> str:
 
 
 def format_drift(drift: Mapping[str, Any]) -> str:
-    """Return a sentence on the drift of the model's long rollouts.
-
-    Args:
-        drift: ``statistics.drift`` of the model's own row.
-    """
+    """Return a sentence on ``statistics.drift`` of the model's own long rollouts."""
     if drift["difference"] is None:
         return "Long rollouts have fewer than 32 frames: their drift is not measured."
     first, last, change = (drift[name] for name in ("first16", "last16", "difference"))
@@ -174,7 +162,7 @@ def format_lpips(metrics: Mapping[str, Any]) -> str:
     found = {method: masks["all"].get("lpips") for method, masks in metrics["results"].items()}
     if not all(found.values()):
         return metrics["protocol"]["lpips"]
-    said = (f"{label} {number(found[m], 3)}" for m, label in METHOD_NAMES.items() if m in found)
+    said = (f"{label} {number(found[method], 3)}" for method, label in labelled(found))
     name = metrics["protocol"].get("lpips_name") or "LPIPS"
     return f"{name} of whole images, lower is better: {'; '.join(said)}."
 
@@ -188,8 +176,7 @@ def format_fvd(metrics: Mapping[str, Any]) -> str:
     for kind, name in found["names"].items():
         values = (
             f"{label} {found['results'][method][kind]['value']:.4g}"
-            for method, label in METHOD_NAMES.items()
-            if method in found["results"]
+            for method, label in labelled(found["results"])
         )
         said.append(f"{name}, lower is better: {'; '.join(values)}")
     return f"{'. '.join(said)}."
@@ -219,8 +206,7 @@ def format_scs(metrics: Mapping[str, Any]) -> list[str]:
         return []
     values = "; ".join(
         f"{label} {spread(found['results'][method], 1)}"
-        for method, label in METHOD_NAMES.items()
-        if method in found["results"]
+        for method, label in labelled(found["results"])
     )
     ceiling = spread(found["ceiling"], 1)
     return [f"{found['name']}, higher is better: {values}; the true clip {ceiling}."]
@@ -259,18 +245,12 @@ def format_map_growth(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Return the report's sentences for the terminal: baselines first, then the map.
-
-    Args:
-        metrics: the content of ``metrics.json``.
-    """
+    """Return the report's sentences for the terminal: baselines first, then the map."""
     margins, own = metrics["margins"], own_method(metrics["results"])
     lines = [NO_MEMORY]
     if own == "memory":
-        lines = [
-            format_verdict(margins["empty"]["seen"]["psnr"], "seen before"),
-            format_verdict(margins["empty"]["unseen"]["psnr"], "never seen"),
-        ]
+        masks = {"seen": "seen before", "unseen": "never seen"}
+        lines = [format_verdict(margins["empty"][m]["psnr"], where) for m, where in masks.items()]
     rivals = [name for name in ("reproject", "none") if name in margins]
     lines += [format_comparison(margins[name], name, own) for name in rivals]
     if own == "memory" and "none" not in margins:
@@ -287,7 +267,6 @@ def score_lines(metrics: Mapping[str, Any]) -> list[str]:
     results = metrics["results"]
     rows = [
         [label, *(with_error(results[method][mask]["psnr"], 2) for mask in MASK_NAMES)]
-        for method, label in METHOD_NAMES.items()
-        if method in results
+        for method, label in labelled(results)
     ]
     return Table.of(["PSNR, dB", *MASK_NAMES.values()], rows).text()

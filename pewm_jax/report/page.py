@@ -16,8 +16,9 @@ from typing import ClassVar, TypeAlias
 
 import jinja2
 
+from pewm_jax.io import atomic
 from pewm_jax.report.charts import Chart
-from pewm_jax.report.table import Table
+from pewm_jax.report.table import Row, Table
 
 TEMPLATE = Path(__file__).with_name("page.html.jinja")
 
@@ -108,14 +109,25 @@ class Section:
     title: str
     blocks: Sequence[Block]
 
+    @classmethod
+    def of_table(
+        cls, title: str, header: Sequence[str], rows: Sequence[Row], note: str = "", text: str = ""
+    ) -> Section:
+        """Return a section with a text, a table and a note below it, as far as they are given."""
+        above = [Text(text)] if text else []
+        below = [Text(note, "quiet")] if note else []
+        return cls(title, [*above, TableBlock(Table(header, rows)), *below])
+
+    @classmethod
+    def of_note(cls, note: str) -> Section:
+        """Return a section of one quiet sentence, such as why something was not measured."""
+        return cls("", [Text(note, "quiet")])
+
 
 def render(title: str, opening: Sequence[Block], sections: Sequence[Section | None]) -> str:
     """Return a page as HTML.
 
-    Args:
-        title: its title; a line break starts a new line.
-        opening: the blocks before the first section.
-        sections: the sections; None is skipped.
+    A line break in the title starts a new line. A section that is None is skipped.
     """
     return _template().render(
         title=title.replace("\n", ", "),
@@ -123,6 +135,15 @@ def render(title: str, opening: Sequence[Block], sections: Sequence[Section | No
         opening=opening,
         sections=[section for section in sections if section is not None],
     )
+
+
+def write_study(page: Path, markdown: str, scores: Table, numbers: Table, chart: Chart) -> None:
+    """Write a page in Markdown and, beside it, scores (.tex), numbers (.csv) and a chart (.png)."""
+    atomic.write_text(page, markdown)
+    atomic.write_text(page.with_suffix(".tex"), scores.latex())
+    atomic.write_text(page.with_suffix(".csv"), numbers.csv())
+    with atomic.replacing(page.with_suffix(".png")) as partial:
+        partial.write_bytes(chart.png())
 
 
 def data_uri(content: bytes, media: str = "image/png") -> str:

@@ -40,6 +40,15 @@ def as_bytes(rgb: np.ndarray) -> np.ndarray:
     return np.rint((np.clip(rgb.astype(np.float32), -1, 1) + 1) * 127.5).astype(np.uint8)
 
 
+def after_present(
+    present: Frames, rgb_THWC: np.ndarray, depth_THW: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return uint8 colours and depth of T frames, preceded by the last frame of ``present``."""
+    rgb = [as_bytes(np.asarray(x)) for x in (present.rgb_THWC[-1:], rgb_THWC)]
+    depth = [np.asarray(x, np.float32) for x in (present.depth_THW[-1:], depth_THW)]
+    return np.concatenate(rgb), np.concatenate(depth)
+
+
 def enlarge(image_HWC: np.ndarray, width: int) -> np.ndarray:
     """Resize a uint8 image (cubic) to a width, keeping its aspect ratio."""
     height = round(image_HWC.shape[0] * width / image_HWC.shape[1])
@@ -80,7 +89,7 @@ def grid(
     cell: int = 128,
     gap: int = 6,
 ) -> np.ndarray:
-    """Arrange images in a captioned grid.
+    """Arrange images in a captioned grid, one uint8 image with even sides.
 
     Args:
         rows: caption and images (uint8, all of one shape) of each row.
@@ -88,9 +97,6 @@ def grid(
         title: a line above the grid.
         cell: width of an image, pixels.
         gap: space between images, pixels.
-
-    Returns:
-        One uint8 image with even sides.
     """
     tall = round(rows[0][1][0].shape[0] * cell / rows[0][1][0].shape[1])
     left = 16 + max(int(font(15).getlength(caption)) for caption, _ in rows) + 10

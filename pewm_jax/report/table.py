@@ -100,10 +100,8 @@ CellLike: TypeAlias = Cell | str
 class Row:
     """A row of a table.
 
-    Attributes:
-        cells: its cells; a heading has only its text.
-        kind: ``heading`` spans all columns, ``highlight`` is tinted.
-        rule: whether LaTeX draws a rule above it.
+    A ``heading`` has one cell, which spans all columns; a ``highlight`` is tinted. LaTeX draws a
+    ``rule`` above it.
     """
 
     cells: tuple[Cell, ...]
@@ -219,6 +217,15 @@ def with_half_width(entry: Mapping[str, Any] | None, digits: int, *, sign: bool 
         return Cell()
     half = None if entry["low"] is None else (entry["high"] - entry["low"]) / 2
     return Cell(entry["mean"], digits, error=half, sign=sign)
+
+
+def score_cells(
+    columns: Mapping[str, tuple[str, int]], entries: Mapping[str, Any], *, sign: bool = False
+) -> list[Cell]:
+    """Return the cells of scores with half of their interval; a column is a heading and digits."""
+    return [
+        with_half_width(entries[score], digits, sign=sign) for score, (_, digits) in columns.items()
+    ]
 
 
 def _cells(cells: Iterable[CellLike]) -> tuple[Cell, ...]:

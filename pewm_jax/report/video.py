@@ -51,15 +51,7 @@ def side_by_side(
 
 
 def small_frames(columns: Sequence[tuple[str, np.ndarray]], *, cell: int = 160) -> list[np.ndarray]:
-    """Draw the colours of several versions side by side, for a small video.
-
-    Args:
-        columns: caption and colours (T, H, W, 3) of each version.
-        cell: width of an image, pixels.
-
-    Returns:
-        T uint8 images of one size.
-    """
+    """Draw the colours (T, H, W, 3) of several captioned versions side by side: T uint8 images."""
     height, width = columns[0][1].shape[1:3]
     header, gap = 20, 4
     size = (gap + len(columns) * (cell + gap), header + round(height * cell / width) + gap)
@@ -92,11 +84,9 @@ def encode_gif(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> by
 
 
 def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> bytes:
-    """Encode images as an MP4 with H.264, yuv420p; equal images give equal bytes.
+    """Encode uint8 (H, W, 3) images with even sides as an MP4 with H.264, yuv420p.
 
-    Args:
-        pictures: uint8 (H, W, 3) images with even sides, all of one size.
-        frames_per_second: playing speed.
+    Equal images give equal bytes.
     """
     buffer = io.BytesIO()
     film = Film(buffer, pictures[0].shape[:2], frames_per_second)
@@ -114,13 +104,7 @@ class Film:
     """
 
     def __init__(self, where: io.BytesIO | str, size: tuple[int, int], frames_per_second: int = 4):
-        """Open the file.
-
-        Args:
-            where: a buffer, or the path of a file.
-            size: height and width, even.
-            frames_per_second: playing speed.
-        """
+        """Open a buffer or the path of a file, for images of an even height and width."""
         self._container = av.open(where, "w", format="mp4")
         self._stream = self._container.add_stream("libx264", rate=frames_per_second)
         self._stream.height, self._stream.width = size

@@ -60,7 +60,6 @@ class Decision:
     """The decision of a method for a task.
 
     Attributes:
-        actions_N: the actions.
         foreseen: the predicted cost; None for a policy alone.
         found: number of samples of a plan → the best actions so far; empty for other methods.
     """
@@ -74,10 +73,7 @@ class Decision:
 class Predictors:
     """The predictors: the evaluated model, baselines and ground truth.
 
-    Attributes:
-        config: configuration of the model.
-        params: its weights.
-        batch: number of candidates imagined at once.
+    ``none`` is a model trained without memory; ``batch`` the number of candidates imagined at once.
     """
 
     config: Config
@@ -127,10 +123,7 @@ class Predictors:
 class Reprojection:
     """A rollout without a network: observed pixels, reprojected to each candidate's final pose.
 
-    Attributes:
-        motion: the motion of an action.
-        settings: the rendering settings.
-        observed: (S,) observed frames; the last one is the present.
+    The last one of the (S,) observed frames is the present.
     """
 
     motion: ActionConfig
@@ -157,12 +150,7 @@ def _reproject(settings: ReprojectSettings, observed: Frames, moves_KN3: Any) ->
 def method_names(
     proposals: tuple[int, ...], predictors: tuple[str, ...] = PREDICTORS
 ) -> tuple[str, ...]:
-    """Return the methods of the table.
-
-    Args:
-        proposals: numbers of ranked proposals.
-        predictors: the predictors.
-    """
+    """Return the methods of the table, for numbers of ranked proposals and predictors."""
     ranked = (f"rank{count}-{predictor}" for count in proposals for predictor in predictors)
     plans = (f"{what}-{predictor}" for what in ("mpc", "loop") for predictor in predictors)
     return ("policy", *ranked, *plans)
@@ -176,15 +164,7 @@ def decide(
     cost: FrameCost,
     config: PlanConfig,
 ) -> Decision:
-    """Choose actions for a task.
-
-    Args:
-        name: one of ``method_names``.
-        goal: the task.
-        predictors: the predictors.
-        policy: returns proposals.
-        cost: distance of frames from the goal.
-        config: settings of plans.
+    """Choose actions for a task by one of ``method_names``; ``cost`` is the distance from the goal.
 
     Raises:
         UserError: a cost is not finite.
@@ -285,13 +265,7 @@ def wanderer(task: TaskInput, count: int, *, seed: int = 0) -> np.ndarray:
 
 
 def nomad(config: NomadConfig, params: Params, motion: ActionConfig) -> Policy:
-    """Return NoMaD as a ``Policy``: its waypoints, converted to the nearest discrete actions.
-
-    Args:
-        config: the policy.
-        params: its parameters.
-        motion: the motion of an action.
-    """
+    """Return NoMaD as a ``Policy``: its waypoints, converted to the nearest discrete actions."""
 
     def propose(task: TaskInput, count: int) -> np.ndarray:
         if task.actions > config.waypoints:
@@ -317,14 +291,7 @@ SETTINGS = "config.json"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class LoadedPolicy:
-    """A trained NoMaD.
-
-    Attributes:
-        folder: folder of its run.
-        config: configuration of its training.
-        weights: the policy's parameters.
-        digest: hash of weights and settings, see ``model_digest``.
-    """
+    """A trained NoMaD; ``digest`` is the hash of weights and settings, see ``model_digest``."""
 
     folder: Path
     config: Config

@@ -13,7 +13,7 @@ import dataclasses
 import jax
 import numpy as np
 
-from pewm_jax.config import ActionConfig, UserError
+from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.make_episode import SPLITS
 from pewm_jax.data.navigation import PathsToGoal, line_is_free, sample_free
 from pewm_jax.data.simulator import Simulator, move, open_simulator
@@ -34,11 +34,8 @@ TEST = 2
 class TaskInput:
     """The inputs of a policy.
 
-    Attributes:
-        number: number of the task, used as a seed.
-        actions: number of actions.
-        context: earlier observations; the last frame is the present one.
-        frame: the frame at the goal, T = 1.
+    The last frame of ``context``, the earlier observations, is the present one; ``frame`` is that
+    at the goal, T = 1; ``number`` is used as a seed.
     """
 
     number: int
@@ -52,7 +49,6 @@ class Goal:
     """A task.
 
     Attributes:
-        number: number of the task.
         simulator: the house.
         table_A3: the motion of each discrete action.
         expert_N: the actions of the walk that ends at the goal.
@@ -95,15 +91,9 @@ class Goal:
 def open_goal(
     number: int, *, houses: int, actions: int, context: int, motion: ActionConfig, size: int
 ) -> Goal:
-    """Return a task.
+    """Return a task; tasks use the ``houses`` held-out houses in turn.
 
-    Args:
-        number: number of the task; tasks use houses in turn.
-        houses: number of held-out houses.
-        actions: number of actions.
-        context: number of earlier frames, at least 2.
-        motion: the motion of an action.
-        size: side of the square images, pixels.
+    There are at least 2 earlier frames, ``context``; images are squares of ``size`` pixels.
 
     Raises:
         UserError: the house is too small for such a walk.
@@ -127,22 +117,28 @@ def open_goal(
         return Goal(number, simulator, table, expert, walk, context_frames, goal, shortest)
     raise UserError(
         f"{simulator.scene.name} is too small for a walk of {actions} actions that ends "
-        f"{LEAST_M:g} "
-        "m away: use fewer houses."
+        f"{LEAST_M:g} m away: use fewer houses."
+    )
+
+
+def goal_of(config: Config, number: int, houses: int, actions: int) -> Goal:
+    """Return a task with the context, the actions and the images of a model; see ``open_goal``."""
+    return open_goal(
+        number,
+        houses=houses,
+        actions=actions,
+        context=config.data.context,
+        motion=config.model.actions,
+        size=config.model.clip.height,
     )
 
 
 def near(home: Goal, count: int, actions: int) -> list[Goal]:
-    """Return tasks near the places observed before a task.
+    """Return tasks near the places observed before a task, each a walk of ``actions`` actions.
 
     They start at most ``NEAR_M`` from its start or from the middle of its walk, visible from that
     place, and end at most twice as far from there and at least ``NEAR_LEAST_M`` from their own
     start. The last frame of each one's context is the view at its own start.
-
-    Args:
-        home: the task.
-        count: number of tasks.
-        actions: number of actions of the walk to each goal.
 
     Raises:
         UserError: the house is too small for them.
@@ -174,8 +170,7 @@ def near(home: Goal, count: int, actions: int) -> list[Goal]:
     if len(tasks) < count:
         raise UserError(
             f"{home.house} has room for only {len(tasks)} of {count} walks near the observed "
-            "places: "
-            "use fewer tasks."
+            "places: use fewer tasks."
         )
     return tasks
 

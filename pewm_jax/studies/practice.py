@@ -9,23 +9,24 @@ from __future__ import annotations
 
 import dataclasses
 import datetime as dt
+import functools
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.eval import intervals
+from pewm_jax.eval import statistics
 from pewm_jax.eval.loaded_run import LoadedRun, has_memory, open_run
 from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import TABLE, ResultCache, require_same_inputs
 from pewm_jax.planning import practice
-from pewm_jax.planning.practice import PracticeEnvironment, PracticeWalk
+from pewm_jax.planning.practice import PracticeWalk
 from pewm_jax.report import pictures
-from pewm_jax.report.table import Cell, Table
+from pewm_jax.report.table import Cell, Table, score_cells
 from pewm_jax.studies import practice_piece
 from pewm_jax.studies.deciders import LoadedPolicy, model_digest, open_policy
 from pewm_jax.studies.goals import Goal
@@ -43,7 +44,6 @@ from pewm_jax.studies.practice_piece import (
     open_home,
     place_of,
 )
-from pewm_jax.studies.table2_page import score_cells
 
 Log = Callable[[str], Any]
 DECIDED_BY, LEVEL = "success", 0.01
@@ -63,6 +63,10 @@ LABELS = {
     "empty": "practised in the world, empty memory",
     "real": "practised in the house itself",
 }
+DIFFERENCES = (
+    *((REAL, CHANCE), (MEMORY, BEFORE), (MEMORY, EMPTY)),
+    *((REAL, MEMORY), (BEFORE, CHANCE)),
+)
 SHOWN_PLACES = {"real": "the house itself", "memory": "with its memory", "empty": "empty memory"}
 SHOWN = 11
 """Number of images per walk."""
@@ -71,14 +75,10 @@ SHOWN = 11
 def run(
     model: str | Path, policy: str | Path, out: Path, study: PracticeConfig, log: Log = print
 ) -> Path:
-    """Let a policy practise in every house, and measure it before and after.
+    """Let a policy, the run of a NoMaD, practise in every house; measure it before and after.
 
-    Args:
-        model: a run folder, or the name of weights that ship with the library.
-        policy: the run of a NoMaD.
-        out: the output folder; the same call resumes.
-        study: the settings.
-        log: prints a line.
+    ``model`` is a run folder, or the name of weights that ship with the library. The same call
+    resumes.
 
     Returns:
         The path of the table in Markdown; in the same folder .png and ``results.json``.
@@ -103,27 +103,24 @@ def run(
         for house, seed, how in pieces:
             name = f"house{house:04d}/{how}-seed{seed}"
 
-            def make(
-                house: int = house, seed: int = seed, how: str = how, name: str = name
-            ) -> dict[str, Any]:
-                home = open_home(study, world.config, house)
-                return practice_piece.make(world, begun, home, study, how, seed, out / name)
-
-            piece = cache.compute(f"{name}/scores", make)
-            made[how].append(piece)
+            make = functools.partial(
+                practice_piece.make, world, begun, study, house, how, seed, out / name
+            )
+            made[how].append(cache.compute(f"{name}/scores", make))
             meter.advance(1)
     log(meter.summary())
     results = summary(made) | {
         "about": about
         | {"model": str(model), "date": dt.datetime.now(dt.UTC).date().isoformat()}
-        | {"within_m": WITHIN_M, "within_deg": WITHIN_DEG, "how": intervals.how()}
+        | {"within_m": WITHIN_M, "within_deg": WITHIN_DEG, "how": statistics.interval_facts()}
     }
     atomic.write_text(out / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     page = out / "practice.md"
-    shown = [
-        (home.house, {how: _first_walk(place, home, begun, study) for how, place in there.items()})
-        for home, there in _places_shown(world, study)
-    ]
+    shown = []
+    for house in range(min(study.shown, study.houses)):
+        home = open_home(study, world.config, house)
+        walks = {how: _first_walk(world, home, begun, study, how) for how in SHOWN_PLACES}
+        shown.append((home.house, walks))
     write_page(results, page, shown)
     return page
 
@@ -156,25 +153,16 @@ def _require_fit(
     if frames < own.frames:
         raise UserError(
             f"walks of {study.practice.blocks} blocks have {frames} frames, but {policy} is "
-            "trained "
-            f"on clips of {own.frames}: use more --blocks."
+            f"trained on clips of {own.frames}: use more --blocks."
         )
 
 
-def _places_shown(
-    world: LoadedRun, study: PracticeConfig
-) -> Iterator[tuple[Goal, dict[str, PracticeEnvironment]]]:
-    for house in range(min(study.shown, study.houses)):
-        home = open_home(study, world.config, house)
-        motion = world.config.model.actions
-        yield home, {how: place_of(world, home, motion, how) for how in (REAL, MEMORY, EMPTY)}
-
-
 def _first_walk(
-    place: PracticeEnvironment, home: Goal, begun: LoadedPolicy, study: PracticeConfig
+    world: LoadedRun, home: Goal, begun: LoadedPolicy, study: PracticeConfig, how: str
 ) -> PracticeWalk:
-    seed = study.seeds[0]
-    return next(practice.walks(place, home.context, act_of(begun), study.practice, seed))
+    place = place_of(world, home, world.config.model.actions, how)
+    walks = practice.walks(place, home.context, act_of(begun), study.practice, study.seeds[0])
+    return next(walks)
 
 
 def power(practised_C: np.ndarray, chance_C: np.ndarray, houses_C: np.ndarray) -> float | None:
@@ -182,26 +170,20 @@ def power(practised_C: np.ndarray, chance_C: np.ndarray, houses_C: np.ndarray) -
 
     Practice in the real house is an upper bound for practice in any world. If it does not beat
     random walks, the task cannot distinguish worlds. The p value is one-sided, from the bootstrap
-    over houses; None for fewer than two houses.
-
-    Args:
-        practised_C: score of each goal after practice in the house itself; higher is better.
-        chance_C: score of each goal with random walks.
-        houses_C: index of each goal's house.
+    over houses of each goal's scores (higher is better); None for fewer than two houses.
     """
     gain_C = practised_C - chance_C
-    p_value = intervals.p_over_houses(gain_C, houses_C)
+    p_value = statistics.p_over_houses(gain_C, houses_C)
     if p_value is None:
         return None
-    better = intervals.over_houses(gain_C, houses_C)["mean"] > 0
+    better = statistics.over_houses(gain_C, houses_C)["mean"] > 0
     return p_value / 2 if better else 1 - p_value / 2
 
 
 def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Return means over houses with 95 % intervals, and differences, paired by task and seed."""
-    houses = np.unique(
-        [piece["house"] for piece in made[BEFORE] for _ in piece["tasks"]], return_inverse=True
-    )[1]
+    named = [piece["house"] for piece in made[BEFORE] for _ in piece["tasks"]]
+    houses = np.unique(named, return_inverse=True)[1]
     values = {
         how: {
             metric: np.array([task[metric] for piece in pieces for task in piece["tasks"]])
@@ -209,13 +191,6 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
         }
         for how, pieces in made.items()
     }
-    differences = (
-        (REAL, CHANCE),
-        (MEMORY, BEFORE),
-        (MEMORY, EMPTY),
-        (REAL, MEMORY),
-        (BEFORE, CHANCE),
-    )
     p_value = power(values[REAL][DECIDED_BY], values[CHANCE][DECIDED_BY], houses)
     walked = {
         how: {
@@ -232,16 +207,12 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
             "level": LEVEL,
             "compares": p_value is not None and p_value < LEVEL,
         },
-        "rows": {
-            how: {metric: intervals.entry(x, houses) for metric, x in by.items()}
-            for how, by in values.items()
-        },
+        "rows": {how: statistics.entries(by, houses) for how, by in values.items()},
         "differences": {
-            f"{one} - {other}": {
-                metric: intervals.entry(x - values[other][metric], houses)
-                for metric, x in values[one].items()
-            }
-            for one, other in differences
+            f"{one} - {other}": statistics.entries(
+                {metric: x - values[other][metric] for metric, x in values[one].items()}, houses
+            )
+            for one, other in DIFFERENCES
         },
         "walked": walked,
         "houses": len(set(houses.tolist())),
@@ -263,10 +234,11 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
     headings = [heading for heading, _ in COLUMNS.values()]
     rows = [[LABELS[how], *score_cells(COLUMNS, row)] for how, row in results["rows"].items()]
     gains = [
-        [f"{LABELS[one]} − {LABELS[other]}", *score_cells(COLUMNS, entries, sign=True)]
-        for (one, other), entries in (
-            (name.split(" - "), entries) for name, entries in results["differences"].items()
-        )
+        [
+            " − ".join(LABELS[how] for how in name.split(" - ")),
+            *score_cells(COLUMNS, entries, sign=True),
+        ]
+        for name, entries in results["differences"].items()
     ]
     walked = [
         [LABELS[how], Cell(found["forward"], 1), Cell(found["through_walls"], 1)]
@@ -323,8 +295,7 @@ def _power(results: Mapping[str, Any]) -> str:
         return f"{words} Below {test['level']:g}: the task can distinguish worlds."
     return (
         f"**{words} Not below {test['level']:g}: the task has no power, because even practice in "
-        "the "
-        "house itself does not beat chance. No comparison between worlds is drawn from it.**"
+        "the house itself does not beat chance. No comparison between worlds is drawn from it.**"
     )
 
 

@@ -56,9 +56,7 @@ class PracticeConfig:
         actions: number of actions of the walk to a goal.
         most: largest number of actions of the policy per goal.
         replan: number of actions taken from a proposal before the next.
-        practice: settings of practice.
         steps: number of training steps on its walks.
-        learning_rate: learning rate of that training.
         seeds: seeds of practice and training.
         shown: number of houses whose first walks are in the image.
     """
@@ -94,26 +92,20 @@ class PracticeConfig:
 def make(
     world: LoadedRun,
     begun: LoadedPolicy,
-    home: Goal,
     study: PracticeConfig,
+    house: int,
     how: str,
     seed: int,
     folder: Path,
 ) -> dict[str, Any]:
     """Return the scores of one policy in one house, and statistics of its practice.
 
-    Args:
-        world: the world that imagines the house.
-        begun: the policy before practice.
-        home: the house, and its observations.
-        study: the settings.
-        how: one of ``ROWS``.
-        seed: seed of practice and training.
-        folder: folder of its walks and its training.
+    ``how`` is one of ``ROWS``; the folder is that of its walks and its training.
 
     Raises:
         UserError: a loss is not finite, or the folder contains walks with other settings.
     """
+    home = open_home(study, world.config, house)
     piece: dict[str, Any] = {"house": home.house, "walked": {}}
     act = act_of(begun)
     if how == CHANCE:
@@ -153,14 +145,7 @@ def _walk_statistics(folder: Path, home: Goal) -> dict[str, float]:
 
 def open_home(study: PracticeConfig, config: Config, house: int) -> Goal:
     """Return the first task of a house, whose context contains the agent's observations."""
-    return goals.open_goal(
-        house,
-        houses=study.houses,
-        actions=study.actions,
-        context=config.data.context,
-        motion=config.model.actions,
-        size=config.model.clip.height,
-    )
+    return goals.goal_of(config, house, study.houses, study.actions)
 
 
 def place_of(world: LoadedRun, home: Goal, motion: ActionConfig, how: str) -> PracticeEnvironment:

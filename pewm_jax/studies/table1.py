@@ -9,19 +9,26 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+import itertools
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pewm_jax.config import Config, UserError
-from pewm_jax.eval import intervals
+from pewm_jax.eval import statistics
+from pewm_jax.eval.metrics.images import MASKS
+from pewm_jax.eval.statistics import scores
 from pewm_jax.io import atomic
-from pewm_jax.studies import table1_numbers, table1_page, table1_rows, table1_training
-from pewm_jax.studies.table1_rows import Row
+from pewm_jax.studies import table1_page, table1_rows, table1_training
+from pewm_jax.studies.table1_page import GAP, SETS
+from pewm_jax.studies.table1_rows import CONTROL, PAPER_FORM, Row
 from pewm_jax.studies.table1_scoring import (
     BASELINES,
+    SRC,
     Arrays,
     Scorer,
     open_scorer,
@@ -97,9 +104,7 @@ def run(
                 group = pieces.setdefault(name, [])
                 if len(group) == number:
                     group.append(arrays)
-        numbers = table1_numbers.summary(
-            pieces, truth, scorer.house_of_clip, scorer.nets, scorer.frames
-        )
+        numbers = summary(pieces, truth, scorer.house_of_clip, scorer.nets, scorer.frames)
         facts = _facts(study, scorer, chosen, plan, seeds[: number + 1], ablation)
         results = {"schema": SCHEMA, "about": facts, **numbers}
         text = json.dumps(results, indent=1, allow_nan=False, ensure_ascii=False)
@@ -163,14 +168,14 @@ def _timing(out: Path, name: str) -> Iterator[None]:
     try:
         yield
     finally:
-        kept = read_hours(out / HOURS)
+        kept = _read_hours(out / HOURS)
         wall, cpu = kept.get(name, (0.0, 0.0))
         wall += (time.monotonic() - began) / 3600
         cpu += (time.process_time() - worked) / 3600
         atomic.write_text(out / HOURS, json.dumps(kept | {name: (wall, cpu)}, indent=1) + "\n")
 
 
-def read_hours(path: Path) -> dict[str, tuple[float, float]]:
+def _read_hours(path: Path) -> dict[str, tuple[float, float]]:
     """Return wall-clock and processor hours of each unit."""
     try:
         return {name: (pair[0], pair[1]) for name, pair in json.loads(path.read_text()).items()}
@@ -188,7 +193,7 @@ def _facts(
 ) -> dict[str, Any]:
     """Return the description of how the table was made."""
     pieces = ["before", *(f"seed{seed}/{row.name}" for seed in seeds for row in rows)]
-    kept = read_hours(study.out / HOURS)
+    kept = _read_hours(study.out / HOURS)
     hours = [kept[name] for name in pieces if name in kept]
     described = {
         row.name: {
@@ -220,5 +225,200 @@ def _facts(
         "left_out": dict(scorer.left_out),
         "reproject": scorer.reprojection(study.out).facts(),
         "hours": {"clock": sum(pair[0] for pair in hours), "cpu": sum(p[1] for p in hours)},
-        "how": intervals.how(),
+        "how": statistics.interval_facts(),
     }
+
+
+CHAIN = (
+    "none",
+    "none-attend",
+    "images-attend",
+    "voxel-attend-without_depth",
+    "map2d-attend",
+    "voxel-attend",
+    "voxel-attend-sinusoid",
+)
+"""The steps of the paper's order, worst first, between comparable rows: the second row has a reader
+without input, and all readers use projective positions except the last, which is the paper's own
+form."""
+AGAINST = ("none", "none-attend", "voxel-attend", "reproject", "copy")
+"""The reference rows for paired differences; in an ablation also the table's own row, and the
+reader without input (``none-attend-…``)."""
+
+
+def by_clip(arrays: Arrays) -> dict[str, np.ndarray]:
+    """Return a value per clip of each metric, (C,), under names such as ``psnr/seen``."""
+    found = {
+        f"{metric}/{mask}": values
+        for mask, by_metric in scores(arrays["sums"].sum(1)).items()
+        for metric, values in by_metric.items()
+        if metric != "lpips" or mask == MASKS[-1]
+    }
+    found[GAP] = found["psnr/seen"] - found["psnr/unseen"]
+    found |= {name: arrays[name] for name in ("src", "dreamsim") if name in arrays}
+    return found
+
+
+def per_frame(arrays: Arrays) -> dict[str, np.ndarray]:
+    """Return PSNR of each frame, (C, T), by mask."""
+    return {f"psnr/{mask}": found["psnr"] for mask, found in scores(arrays["sums"]).items()}
+
+
+def summary(
+    pieces: Mapping[str, Sequence[Arrays]],
+    truth: Arrays,
+    houses_C: np.ndarray,
+    nets: Mapping[str, Any],
+    frames: int = 0,
+) -> dict[str, Any]:
+    """Return the numbers of the table from the scores.
+
+    Args:
+        pieces: row → its scores, one per training seed; methods without a network have one.
+        truth: from ``Scorer.truth``.
+        houses_C: index of each clip's house.
+        nets: the metrics that need weights.
+        frames: number of frames of the clips of FVD and KVD, for their names.
+
+    Returns:
+        ``rows[name]``: ``seeds``; ``measures[name]`` as ``statistics.entry`` (averaged over
+        training seeds within a clip), with ``over_seeds`` if there are several; ``per_frame``;
+        ``fvd`` and ``kvd`` of all clips, and ``fvd_half`` and ``kvd_half``, to be compared with the
+        floor, with ``per_seed``. ``floors``, with the ``name`` for that number of clips; and
+        ``differences[against][row][measure]``, paired, row − against, with both intervals (for FVD
+        and KVD only over seeds), p values over houses and over seeds (``p``, ``p_seeds``), and the
+        same adjusted for the rows of the table (``adjust``).
+    """
+    values = {name: _stack_seeds(map(by_clip, group)) for name, group in pieces.items()}
+    distances = {kind: nets[kind] for kind in SETS if kind in nets and "logits" in truth}
+    rows: dict[str, Any] = {}
+    for name, group in pieces.items():
+        by_frame = _stack_seeds(map(per_frame, group))
+        rows[name] = {
+            "seeds": len(group),
+            "measures": {
+                measure: _entry(values_KC, houses_C) for measure, values_KC in values[name].items()
+            },
+            "per_frame": {
+                measure: statistics.entry(values_KCT.mean(0), houses_C)
+                for measure, values_KCT in by_frame.items()
+            },
+        }
+        for kind, net in distances.items():
+            rows[name]["measures"] |= _set_distances(kind, net, group, truth)
+    floors: dict[str, Any] = {}
+    if "src_floor" in truth:
+        floors[SRC] = {
+            "floor": float(truth["src_floor"].mean()),
+            "ceiling": float(truth["src_ceiling"].mean()),
+        }
+    for kind, net in distances.items():
+        score = net.score(truth["logits"], truth["logits"])
+        floors[kind] = {"floor": score.facts()["floor"], "half_clips": score.half_clips}
+        floors[kind]["name"] = net.name(frames, score.half_clips)
+
+    def minus(first: str, second: str) -> dict[str, Any]:
+        found = _differences(values[first], values[second], houses_C)
+        return found | _set_distance_differences(rows[first], rows[second])
+
+    differences: dict[str, Any] = {
+        against: {name: minus(name, against) for name in pieces if name != against}
+        for against in pieces
+        if against in AGAINST or against.startswith((CONTROL, PAPER_FORM))
+    }
+    order = [
+        {"worse": worse, "better": better, "differences": minus(better, worse)}
+        for worse, better in itertools.pairwise(name for name in CHAIN if name in pieces)
+    ]
+    for found in differences.values():
+        adjust(list(found.values()))
+    adjust([step["differences"] for step in order])
+    return {"rows": rows, "floors": floors, "differences": differences, "order": order}
+
+
+def adjust(family: Sequence[Mapping[str, dict[str, Any]]]) -> None:
+    """Add Holm's adjusted p values to the differences of one table of the page, column by column.
+
+    Each row has its differences by measure; ``p_holm`` and ``p_seeds_holm`` are added to each that
+    has ``p`` and ``p_seeds``.
+    """
+    for measure in {name for found in family for name in found}:
+        column = [found[measure] for found in family if measure in found]
+        for name in ("p", "p_seeds"):
+            adjusted = statistics.holm([each.get(name) for each in column])
+            for each, value in zip(column, adjusted, strict=True):
+                if value is not None:
+                    each[f"{name}_holm"] = value
+
+
+def _stack_seeds(each: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Stack the values of training seeds along a first axis."""
+    some = list(each)
+    return {key: np.stack([one[key] for one in some]) for key in some[0]}
+
+
+def _seed_means(values_KC: np.ndarray, houses_C: np.ndarray) -> list[float]:
+    return [float(statistics.over_houses(one_C, houses_C)["mean"]) for one_C in values_KC]
+
+
+def _entry(values_KC: np.ndarray, houses_C: np.ndarray) -> dict[str, Any]:
+    found = statistics.entry(values_KC.mean(0), houses_C)
+    per_seed = _seed_means(values_KC, houses_C)
+    if np.isfinite(per_seed).all():
+        found["per_seed"] = per_seed
+        found["over_seeds"] = statistics.over_seeds(per_seed)
+    return found
+
+
+def _set_distances(
+    kind: str, net: Any, group: Sequence[Arrays], truth: Arrays
+) -> dict[str, dict[str, Any]]:
+    """Return FVD or KVD per training seed, with mean and Student's interval; also of halves."""
+    found = [net.score(each["logits"], truth["logits"]) for each in group]
+    values = {kind: [float(score.value) for score in found]}
+    if all(score.half is not None for score in found):
+        values[f"{kind}_half"] = [float(score.half.mean) for score in found]
+    entries = {}
+    for name, per_seed in values.items():
+        over = statistics.over_seeds(per_seed)
+        entries[name] = {"mean": over["mean"], "per_seed": per_seed, "over_seeds": over}
+    return entries
+
+
+def _set_distance_differences(
+    first: Mapping[str, Any], second: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return first − second of FVD and KVD, paired by training seed."""
+    found = {}
+    for measure in (f"{kind}{part}" for kind in SETS for part in ("", "_half")):
+        pair = [row["measures"].get(measure) for row in (first, second)]
+        if all(pair):
+            a_K, b_K = np.broadcast_arrays(*(entry["per_seed"] for entry in pair))
+            apart = (a_K - b_K).tolist()
+            over, p = statistics.over_seeds(apart), statistics.p_over_seeds(apart)
+            found[measure] = {"mean": over["mean"], "over_seeds": over, "p_seeds": p}
+    return found
+
+
+def _differences(
+    first: Mapping[str, np.ndarray], second: Mapping[str, np.ndarray], houses_C: np.ndarray
+) -> dict[str, Any]:
+    """Return first − second, clip by clip, and over training seeds.
+
+    Rows of one training seed share a backbone and are paired; methods without a network, and so
+    without seeds, are paired with every seed.
+    """
+    found = {}
+    for measure in first:
+        if measure not in second:
+            continue
+        a_KC, b_KC = first[measure], second[measure]
+        paired_C = a_KC.mean(0) - b_KC.mean(0)
+        found[measure] = statistics.entry(paired_C, houses_C)
+        found[measure]["p"] = statistics.p_over_houses(paired_C, houses_C)
+        means = [_seed_means(group, houses_C) for group in (a_KC, b_KC)]
+        if np.isfinite(np.concatenate(means)).all() and max(map(len, means)) > 1:
+            apart = np.subtract(*np.broadcast_arrays(*means))
+            found[measure]["over_seeds"] = statistics.over_seeds(apart.tolist())
+            found[measure]["p_seeds"] = statistics.p_over_seeds(apart.tolist())
+    return found

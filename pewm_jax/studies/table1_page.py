@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pewm_jax.io import atomic
 from pewm_jax.report.charts import IntervalChart, IntervalRow
+from pewm_jax.report.page import write_study
 from pewm_jax.report.table import Cell, Row, Table, row, with_half_width, with_interval
-from pewm_jax.studies.table1_numbers import GAP, LOWER, SETS
 from pewm_jax.studies.table1_rows import CONTROL, PAPER_FORM
+
+SETS = ("fvd", "kvd")
+"""Metrics of whole sets of clips, which have no value per clip."""
+LOWER = ("lpips", "dreamsim", "depth_mae", "depth_rel", *SETS, "fvd_half", "kvd_half")
+"""Metrics for which lower is better."""
+GAP = "psnr/seen - unseen"
+"""PSNR of seen minus unseen pixels; its difference between rows shows what a memory adds."""
 
 COLUMNS: Mapping[str, tuple[str, int]] = {
     "psnr/seen": ("PSNR seen, dB", 2),
@@ -76,12 +82,11 @@ RIVALS = ("none", "none-attend", "voxel-attend", "reproject")
 NOT_COMPARABLE = (
     "The paper's numbers are for 512 × 512 images of scanned houses, a model of about 3 billion "
     "parameters (our estimate) trained on 8 GPUs for days, DINOv2 features, and an FVD and an "
-    "LPIPS "
-    "whose networks and numbers of clips are not specified; ours are for small images and a small "
-    "model (above). Only the order of the rows, and the signs of differences, can be compared. "
-    "LPIPS and SRC use AlexNet here; the paper's SRC uses DINOv2, over consecutive imagined clips "
-    "with the map growing between them, and ours a way out and back within one clip: it does not "
-    "measure memory."
+    "LPIPS whose networks and numbers of clips are not specified; ours are for small images and a "
+    "small model (above). Only the order of the rows, and the signs of differences, can be "
+    "compared. LPIPS and SRC use AlexNet here; the paper's SRC uses DINOv2, over consecutive "
+    "imagined clips with the map growing between them, and ours a way out and back within one "
+    "clip: it does not measure memory."
 )
 
 
@@ -96,11 +101,8 @@ PAPER_ABLATIONS: Mapping[str, str] = {
 
 def write(results: Mapping[str, Any], page: Path) -> None:
     """Write the table as ``page`` (Markdown) and, beside it, .tex, .csv and .png."""
-    atomic.write_text(page, markdown(results, page.stem))
-    atomic.write_text(page.with_suffix(".tex"), scores_table(results, arrows=True).latex())
-    atomic.write_text(page.with_suffix(".csv"), numbers_table(results).csv())
-    with atomic.replacing(page.with_suffix(".png")) as partial:
-        partial.write_bytes(chart(results).png())
+    scores, numbers = scores_table(results, arrows=True), numbers_table(results)
+    write_study(page, markdown(results, page.stem), scores, numbers, chart(results))
 
 
 def rows_of(results: Mapping[str, Any]) -> list[str]:
@@ -160,28 +162,17 @@ def best_of(results: Mapping[str, Any], names: Sequence[str], measure: str) -> s
     return (min if lower else max)(known)[1]
 
 
-def floor_of(results: Mapping[str, Any], measure: str) -> float | None:
-    """Return the score of the ground truth; None if not measured."""
+def bounds_of(results: Mapping[str, Any], measure: str) -> dict[str, float | None]:
+    """Return the scores of the ground truth, and for SRC of two different places, if measured."""
     floors = results["floors"]
     if measure == "src" and "src[alex]" in floors:
-        return floors["src[alex]"]["ceiling"]
+        return {TRUTH: floors["src[alex]"]["ceiling"], PLACES: floors["src[alex]"]["floor"]}
     found = floors.get(measure.removesuffix("_half"), {}).get("floor")
-    return found["mean"] if found else None
-
-
-def place_floor(results: Mapping[str, Any], measure: str) -> float | None:
-    """Return the score of two different places; None except for SRC."""
-    floors = results["floors"]
-    return floors["src[alex]"]["floor"] if measure == "src" and "src[alex]" in floors else None
+    return {TRUTH: found["mean"] if found else None, PLACES: None}
 
 
 def scores_table(results: Mapping[str, Any], *, arrows: bool = False) -> Table:
-    """Return the table of scores.
-
-    Args:
-        results: the content of ``results.json``.
-        arrows: whether headings have an arrow for the better direction.
-    """
+    """Return the table of scores, with an arrow for the better direction in headings if asked."""
     names, columns = rows_of(results), columns_of(results)
     best = {measure: best_of(results, names, measure) for measure in columns}
     lines: list[Row] = []
@@ -191,29 +182,16 @@ def scores_table(results: Mapping[str, Any], *, arrows: bool = False) -> Table:
             for measure in columns
         ]
         lines.append(row(label(results, name), *cells))
-    lines.append(_bound(results, TRUTH, floor_of, rule=True))
-    if "src" in columns:
-        lines.append(_bound(results, PLACES, place_floor))
+    for bound in (TRUTH, PLACES) if "src" in columns else (TRUTH,):
+        values = {measure: bounds_of(results, measure)[bound] for measure in columns}
+        cells = [Cell(value, COLUMNS[measure][1]) for measure, value in values.items()]
+        lines.append(row(bound, *cells, rule=bound == TRUTH))
     heads = [heading(results, measure) for measure in columns]
     if not arrows:
         return Table(["memory · reader", *heads], lines)
     shown = ["↓" if measure.split("/")[0] in LOWER else "↑" for measure in columns]
     pairs = zip(heads, shown, strict=True)
     return Table(["memory, reader", *(" ".join(pair) for pair in pairs)], lines)
-
-
-def _bound(
-    results: Mapping[str, Any],
-    name: str,
-    number_of: Callable[[Mapping[str, Any], str], float | None],
-    *,
-    rule: bool = False,
-) -> Row:
-    """Return a row with the scores of the ground truth or of two different places."""
-    cells = [
-        Cell(number_of(results, measure), COLUMNS[measure][1]) for measure in columns_of(results)
-    ]
-    return row(name, *cells, rule=rule)
 
 
 def numbers_table(results: Mapping[str, Any]) -> Table:
@@ -229,8 +207,7 @@ def numbers_table(results: Mapping[str, Any]) -> Table:
             shown = ["" if value is None else f"{value:.6g}" for value in ends]
             lines.append([name, measure, *shown, kind, str(found["seeds"]), seeds])
     for measure in columns_of(results):
-        for name, number_of in ((TRUTH, floor_of), (PLACES, place_floor)):
-            number = number_of(results, measure)
+        for name, number in bounds_of(results, measure).items():
             if number is not None:
                 lines.append([name, measure, f"{number:.6g}", "", "", "", "", ""])
     header = ["row", "measure", "mean", "low", "high", "interval_over", "seeds", "per_seed"]
@@ -240,9 +217,8 @@ def numbers_table(results: Mapping[str, Any]) -> Table:
 def chart(results: Mapping[str, Any], measure: str = "psnr/seen") -> IntervalChart:
     """Return the chart of a metric with the interval of every row."""
     known = {name: results["rows"][name]["measures"][measure] for name in rows_of(results)}
-    if all(entry["mean"] is None for entry in known.values()):
-        measure = "psnr/all"  # nothing was seen before
-        known = {name: results["rows"][name]["measures"][measure] for name in rows_of(results)}
+    if measure != "psnr/all" and all(entry["mean"] is None for entry in known.values()):
+        return chart(results, "psnr/all")  # nothing was seen before
     rows = [
         IntervalRow(
             label(results, name),
@@ -265,7 +241,7 @@ def markdown(results: Mapping[str, Any], stem: str) -> str:
     """Return the page."""
     about = results["about"]
     parts = [
-        _title(about),
+        f"# Table 1: {about['ablation'] or 'which memory works'}",
         how(results),
         scores_table(results).markdown(),
         _floors(results),
@@ -290,10 +266,6 @@ def _markdown(header: Sequence[str], rows: Sequence[Sequence[Cell | str]]) -> st
     return Table.of(header, rows).markdown()
 
 
-def _title(about: Mapping[str, Any]) -> str:
-    return f"# Table 1: {about['ablation'] or 'which memory works'}"
-
-
 def how(results: Mapping[str, Any]) -> str:
     """Return a paragraph on how the numbers were measured."""
     about = results["about"]
@@ -305,15 +277,13 @@ def how(results: Mapping[str, Any]) -> str:
         but = "".join(f", {time:g} times as long for rows that say so" for time in times)
         equal = f"equal time ({first:g} + {second:g} {clock}minutes of training steps{but})"
     return (
-        f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; "
-        f"images of {size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} "
-        f"imagined frames in {about['houses']} {about['house']}s, {about['context']} "
-        f"frames of context. Means over {about['house']}s; ± is half of "
-        f"the 95 % interval over {about['house']}s (bootstrap), for FVD and KVD over training "
-        "seeds "
-        f"(Student's). Protocol {about['protocol_sha256'][:12]}. Total wall-clock time "
-        f"{about['hours']['clock']:.1f} hours, processor time {about['hours']['cpu']:.1f} "
-        f"hours; {about['date']}."
+        f"{len(about['seeds'])} training seed(s), {equal}, batches of {about['batch']}; images of "
+        f"{size[0]} × {size[1]}; {about['clips']} clips of {about['frames'] - 1} imagined frames "
+        f"in {about['houses']} {about['house']}s, {about['context']} frames of context. Means over "
+        f"{about['house']}s; ± is half of the 95 % interval over {about['house']}s (bootstrap), "
+        "for FVD and KVD over training seeds (Student's). Protocol "
+        f"{about['protocol_sha256'][:12]}. Total wall-clock time {about['hours']['clock']:.1f} "
+        f"hours, processor time {about['hours']['cpu']:.1f} hours; {about['date']}."
     )
 
 
@@ -359,24 +329,28 @@ def _against(results: Mapping[str, Any], rival: str) -> str:
     """Return every trained row's differences from one of them, paired by clip."""
     if rival not in results["differences"]:
         return ""
-    rows = []
-    for name, found in results["differences"][rival].items():
-        if name in results["about"]["rows"]:
-            rows.append([label(results, name), *_cells_of(results, found, (name, rival))])
-    return f"## Each row minus {label(results, rival)}\n\n{PAIRED}\n\n" + _markdown(
-        ["row", *STEP_HEADINGS], rows
-    )
+    rows = [
+        [label(results, name), *_cells_of(results, found, (name, rival))]
+        for name, found in results["differences"][rival].items()
+        if name in results["about"]["rows"]
+    ]
+    text = _markdown(["row", *STEP_HEADINGS], rows)
+    return f"## Each row minus {label(results, rival)}\n\n{PAIRED}\n\n{text}"
 
 
 def _cells_of(
     results: Mapping[str, Any], differences: Mapping[str, Any], pair: tuple[str, str]
 ) -> list[Cell]:
-    """Return the differences of two rows."""
+    """Return the differences of two rows, with their intervals and marks of significance."""
     cells: list[Cell] = []
     for measure, decimals in STEP_MEASURES.items():
         found = differences.get(measure)
-        sees = not any(lacks_depth(results, name, measure) for name in pair)
-        cells.append(_difference(found, decimals) if found and sees else Cell())
+        if not found or any(lacks_depth(results, name, measure) for name in pair):
+            cells.append(Cell())
+            continue
+        over = found if "low" in found else found["over_seeds"]
+        shown = with_interval(over, decimals, sign=True)
+        cells.append(dataclasses.replace(shown, mark=mark_of(found)))
     over = differences["psnr/seen"].get("over_seeds")
     return [*cells, with_interval(over, 2, sign=True)]
 
@@ -387,17 +361,16 @@ def _order_text(results: Mapping[str, Any]) -> str:
         return ""
     rows = []
     for step in results["order"]:
-        words = f"{label(results, step['better'])} − {label(results, step['worse'])}"
         pair = (step["better"], step["worse"])
+        words = " − ".join(label(results, name) for name in pair)
         rows.append([words, *_cells_of(results, step["differences"], pair)])
     text = _markdown(["step of the paper's order", *STEP_HEADINGS], rows)
     return (
         "## The paper's order\n\nThe paper has no memory < image memory < no depth < 2D map < 3D "
-        "map. Each step here, paired. *None · attend* is our control: a "
-        "reader without input, trained equally long. All readers use projective positions, except "
-        "the last step, which uses the paper's sinusoid. The effect of a memory is the difference "
-        "of seen minus unseen pixels: an improvement of both is not due to memory.\n\n"
-        f"{PAIRED}\n\n{text}"
+        "map. Each step here, paired. *None · attend* is our control: a reader without input, "
+        "trained equally long. All readers use projective positions, except the last step, which "
+        "uses the paper's sinusoid. The effect of a memory is the difference of seen minus unseen "
+        f"pixels: an improvement of both is not due to memory.\n\n{PAIRED}\n\n{text}"
     )
 
 
@@ -410,12 +383,6 @@ def mark_of(entry: Mapping[str, Any]) -> str:
     if houses is None or houses >= ALPHA:
         return ""
     return SIGNIFICANT if over_seeds else HOUSES_ONLY
-
-
-def _difference(entry: Mapping[str, Any], decimals: int) -> Cell:
-    """Return a difference with its interval and its mark of significance."""
-    over = entry if "low" in entry else entry["over_seeds"]
-    return dataclasses.replace(with_interval(over, decimals, sign=True), mark=mark_of(entry))
 
 
 def _paper(results: Mapping[str, Any]) -> str:

@@ -78,30 +78,26 @@ class Row:
 
 
 def main_rows(base: Config) -> tuple[Row, ...]:
-    """Return the rows of the table.
-
-    Args:
-        base: the settings that all rows share; its memory is the paper's.
-    """
+    """Return the rows of the table; the memory of the settings that all share is the paper's."""
     memory, attend = base.model.memory, _attend(base)
     sinusoid = dataclasses.replace(attend, positions="sinusoid", frame="world")
-    voxel = _as(memory, VoxelConfig, attend)
+    voxel = _voxels(base)
     points, surfels = (
         _finer(memory, kind, attend, *scale)
         for kind, scale in ((PointsConfig, POINTS), (SurfelConfig, SURFELS))
     )
     snapshots = max(1, memory.tokens // PATCHES)
-    nothing = _as(memory, NoMemoryConfig, attend)
+    nothing = as_kind(memory, NoMemoryConfig, reader=attend)
     return (
         Row("none", nothing, paper="NWM"),
         Row(CONTROL, nothing, control=True),
         Row(
             "images-attend",
-            _as(memory, ImagesConfig, attend, snapshots=snapshots),
+            as_kind(memory, ImagesConfig, reader=attend, snapshots=snapshots),
             paper="Image Memory",
         ),
         Row("voxel-attend-without_depth", voxel, depth=False, paper="Ours (w/o depth)"),
-        Row("map2d-attend", _as(memory, Map2DConfig, attend), paper="Ours (2D map)"),
+        Row("map2d-attend", as_kind(memory, Map2DConfig, reader=attend), paper="Ours (2D map)"),
         Row(PAPER_FORM, dataclasses.replace(voxel, reader=sinusoid), paper="Ours"),
         Row("voxel-attend", voxel),
         Row("voxel-render", _rendered(base, voxel)),
@@ -112,35 +108,19 @@ def main_rows(base: Config) -> tuple[Row, ...]:
     )
 
 
-def _as(memory: Memory, kind: type[Memory], reader: Reader, **changes: Any) -> Memory:
+def as_kind(memory: Memory, kind: type[Memory], **changes: Any) -> Memory:
     """Return a memory of another kind with the settings that all kinds share."""
-    given: dict[str, Any] = {
-        field.name: getattr(memory, field.name) for field in dataclasses.fields(Memory)
-    }
-    given["reader"] = reader
-    given.update(changes)
-    return kind(**given)
+    shared = {field.name: getattr(memory, field.name) for field in dataclasses.fields(Memory)}
+    return kind(**shared | changes)
 
 
-def _finer(
-    memory: Memory,
-    kind: type[Memory],
-    reader: Reader,
-    scale: float,
-    more: int,
-) -> Memory:
+def _finer(memory: Memory, kind: type[Memory], reader: Reader, scale: float, more: int) -> Memory:
     """Return a memory of coloured points with cubic cells and the same extent."""
     side = round(scale * min(memory.cell_m), 4)
     sizes = zip(memory.cell_m, memory.cells, strict=True)
     cells = tuple(math.ceil(size * count / side) for size, count in sizes)
-    return _as(
-        memory,
-        kind,
-        reader,
-        cell_m=(side, side, side),
-        cells=cells,
-        capacity=more * memory.capacity,
-    )
+    sizes = {"cell_m": (side, side, side), "cells": cells, "capacity": more * memory.capacity}
+    return as_kind(memory, kind, reader=reader, **sizes)
 
 
 def _attend(base: Config) -> AttentionConfig:
@@ -148,6 +128,11 @@ def _attend(base: Config) -> AttentionConfig:
     if not isinstance(reader, AttentionConfig) or isinstance(reader, RenderConfig):
         raise UserError("the settings of Table 1 need memory.reader.kind attend to start from.")
     return reader
+
+
+def _voxels(base: Config) -> Memory:
+    """Return the paper's map, read by attention."""
+    return as_kind(base.model.memory, VoxelConfig, reader=_attend(base))
 
 
 def _rendered(base: Config, memory: Memory) -> Memory:
@@ -170,13 +155,9 @@ def parameters(base: Config, memory: Memory) -> int:
     return sum(leaf.size for leaf in jax.tree.leaves(shapes.get("memory", {})))
 
 
-def _paper_form(base: Config) -> Memory:
-    return next(row.memory for row in main_rows(base) if row.name == PAPER_FORM)
-
-
 def _cell(base: Config, side: str) -> Memory:
     """Return the memory with another cell size on the ground and the same extent and height."""
-    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    memory = _voxels(base)
     x, y, z = memory.cell_m
     scale = float(side) / x
     cells = (*(math.ceil(n / scale) for n in memory.cells[:2]), memory.cells[2])
@@ -193,7 +174,7 @@ def _extent(base: Config, side: str) -> Memory:
     """Return the memory with another extent on the ground, metres."""
     if not 0 < float(side) < math.inf:
         raise ValueError(side)
-    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    memory = _voxels(base)
     x, y, _ = memory.cell_m
     cells = (math.ceil(float(side) / x), math.ceil(float(side) / y), memory.cells[2])
     return dataclasses.replace(memory, cells=cells)
@@ -201,7 +182,7 @@ def _extent(base: Config, side: str) -> Memory:
 
 def _tokens(base: Config, count: str) -> Memory:
     """Return the memory with another number of tokens that condition a clip."""
-    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    memory = _voxels(base)
     if int(count) > MOST_CELLS:
         raise UserError(
             f"{count} tokens need a map of as many cells, more than the limit of {MOST_CELLS:,}: "
@@ -213,13 +194,13 @@ def _tokens(base: Config, count: str) -> Memory:
 
 def _features(base: Config, kind: str) -> Memory:
     """Return the memory with other features: patch colours, codec latents, DINOv2, or points."""
-    memory = _as(base.model.memory, VoxelConfig, _attend(base))
+    memory = _voxels(base)
     if kind.startswith(NETWORK):
         network = dinov2.load(Path(kind.removeprefix(NETWORK)))[0]
         side = memory.encoder.grid(base.model.clip)[0] * network.patch  # as many patches as colours
         return dataclasses.replace(memory, encoder=DINOv2EncoderConfig(size=side, network=network))
     if kind == "points":
-        return _as(memory, PointsConfig, memory.reader)
+        return as_kind(memory, PointsConfig)
     if kind == "latents":
         codec = base.model.codec
         latents = LatentsConfig(channels=codec.rgb_channels, spatial=codec.spatial)
@@ -233,13 +214,7 @@ def _features(base: Config, kind: str) -> Memory:
 
 @dataclasses.dataclass(frozen=True)
 class Ablation:
-    """An ablation of a setting of the paper's map.
-
-    Attributes:
-        make: returns the memory with a value of the setting.
-        values: the default values.
-        about: description of the setting, with its unit.
-    """
+    """An ablation of a setting of the paper's map; ``about`` describes it, with its unit."""
 
     make: Callable[[Config, str], Memory]
     values: tuple[str, ...]
@@ -251,7 +226,11 @@ ABLATIONS: Mapping[str, Ablation] = {
     "extent": Ablation(_extent, ("4", "8", "16", "32"), "side of the map, m"),
     "tokens": Ablation(_tokens, ("96", "192", "384", "768"), "tokens that condition a clip"),
     "features": Ablation(_features, ("colours", "latents", "points"), "what a cell holds"),
-    "time": Ablation(lambda base, _: _paper_form(base), ("1", "4"), "times the others' time"),
+    "time": Ablation(
+        lambda base, _: next(row.memory for row in main_rows(base) if row.name == PAPER_FORM),
+        ("1", "4"),
+        "times the others' time",
+    ),
 }
 """The paper's ablations of the voxel map read by attention; ``time`` trains the paper's own form
 (``PAPER_FORM``) longer, and a reader without input equally long."""
@@ -260,18 +239,13 @@ ABLATIONS: Mapping[str, Ablation] = {
 def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row, ...]:
     """Return the rows of an ablation; a row that is also in the table has the same name.
 
-    Args:
-        base: the settings that all rows share.
-        name: name of the ablation.
-        values: values to try; by default the ablation's own.
-
     Raises:
         UserError: there is no such ablation, or a value cannot be used.
     """
     if name not in ABLATIONS:
         raise UserError(f"there is no ablation {name!r}; choose from {', '.join(ABLATIONS)}.")
     ablation = ABLATIONS[name]
-    plain = _as(base.model.memory, VoxelConfig, _attend(base))
+    plain = _voxels(base)
     found: list[Row] = []
     for value in values or ablation.values:
         try:
@@ -291,6 +265,6 @@ def ablated(base: Config, name: str, values: tuple[str, ...] = ()) -> tuple[Row,
         found.append(Row(row_name, memory, times=times, encoder=folder))
         if name == "time":  # the control: a reader without input, trained equally long
             row_name = CONTROL if own else f"{CONTROL}-{name}_{words}"
-            nothing = _as(base.model.memory, NoMemoryConfig, _attend(base))
+            nothing = as_kind(base.model.memory, NoMemoryConfig, reader=_attend(base))
             found.append(Row(row_name, nothing, times=times, control=True))
     return tuple(found)

@@ -59,12 +59,9 @@ class Scorer:
 
     Attributes:
         config: the settings that all rows share, with those of the protocol.
-        protocol: the scored clips.
-        batches: the clips.
         nets: the available metrics that need weights.
         left_out: name of a metric → reason why it is skipped.
         name: a hash of all that scores depend on besides the weights.
-        log: prints a line.
     """
 
     config: Config
@@ -94,11 +91,7 @@ class Scorer:
         return self.config.model.clip.frames
 
     def row(self, config: Config, *, memory: bool) -> Arrays:
-        """Score a trained row, or return its stored scores.
-
-        Args:
-            config: configuration of its training.
-            memory: whether to use its memory or an empty one.
+        """Score a trained row with its memory or an empty one, or return its stored scores.
 
         Raises:
             UserError: its weights are missing or damaged, or an imagined value is not finite.
@@ -149,25 +142,29 @@ class Scorer:
         return self._cache(out).compute(TRUTH, self._score_truth)
 
     def _score_truth(self) -> Arrays:
-        parts: dict[str, list[np.ndarray]] = {}
-        with Meter("the truth's own numbers", len(self.protocol.clips), "clips") as meter:
-            for batch in self.batches:
-                for key, values in self._truth_of(batch).items():
-                    parts.setdefault(key, []).append(values[: batch.real])
-                meter.advance(batch.real)
-        whole = {key: np.concatenate(each) for key, each in parts.items()}
+        def score(batch: Batch) -> Arrays:
+            video = _joined(batch.context, batch.targets)
+            values: Arrays = {}
+            if "fvd" in self.nets:
+                values["logits"] = self.nets["fvd"].features(video)
+            if SRC in self.nets:
+                values["walks"] = _there_and_back(video, self.frames // 2)
+            return values
+
+        whole = self._over_batches("the truth's own numbers", score)[0]
         if "walks" in whole:
             whole |= self._consistency(whole.pop("walks"))
         return whole
 
-    def _truth_of(self, batch: Batch) -> Arrays:
-        video = _joined(batch.context, batch.targets)
-        values: dict[str, np.ndarray] = {}
-        if "fvd" in self.nets:
-            values["logits"] = self.nets["fvd"].features(video)
-        if SRC in self.nets:
-            values["walks"] = _there_and_back(video, self.frames // 2)
-        return values
+    def _over_batches(self, label: str, score: Callable[[Batch], Arrays]) -> tuple[Arrays, str]:
+        """Return the scores of all clips, and a line on the time they took."""
+        parts: dict[str, list[np.ndarray]] = {}
+        with Meter(label, len(self.protocol.clips), "clips") as meter:
+            for batch in self.batches:
+                for key, values in score(batch).items():
+                    parts.setdefault(key, []).append(values[: batch.real])
+                meter.advance(batch.real)
+        return {key: np.concatenate(each) for key, each in parts.items()}, meter.summary()
 
     def _consistency(self, walks_CTHWC: np.ndarray) -> Arrays:
         """Return SRC of the ground truth, and of each walk with the next clip's return path."""
@@ -181,34 +178,30 @@ class Scorer:
         return found
 
     def _score(self, imagine: Model, label: str) -> Arrays:
-        parts: dict[str, list[np.ndarray]] = {}
-        half = (self.frames - 1) // 2
-        with Meter(label, len(self.protocol.clips), "clips") as meter:
-            for batch in self.batches:
-                seeds, camera = batch.seeds(self.config.evaluate.seeds[0]), batch.targets.camera
-                frames = imagine(batch.context, batch.control, camera, seeds)
-                values = {"sums": batch.sums(frames, self.nets.get("lpips_alex"))}
-                if "fvd" in self.nets:
-                    video = _joined(batch.context, frames)
-                    values["logits"] = self.nets["fvd"].features(video)
-                if SRC in self.nets:
-                    control = there_and_back(batch.control[:, :half])
-                    whole = jax.tree.map(
-                        lambda a, b: np.concatenate([a[:, -1:], b], 1), batch.context.camera, camera
-                    )
-                    there = jax.tree.map(lambda x: _there_and_back(x, half)[:, 1:], whole)
-                    walk = _joined(batch.context, imagine(batch.context, control, there, seeds))
-                    values["src"] = np.asarray(self.nets[SRC](walk, walk))
-                if "dreamsim" in self.nets:
-                    truth = batch.targets.rgb_THWC
-                    values["dreamsim"] = np.asarray(
-                        self.nets["dreamsim"](frames.rgb_THWC, _signal(truth))
-                    )
-                for key, value in values.items():
-                    parts.setdefault(key, []).append(value[: batch.real])
-                meter.advance(batch.real)
-        self.log(meter.summary())
-        return {key: np.concatenate(each) for key, each in parts.items()}
+        half, nets = (self.frames - 1) // 2, self.nets
+
+        def score(batch: Batch) -> Arrays:
+            seeds, camera = batch.seeds(self.config.evaluate.seeds[0]), batch.targets.camera
+            frames = imagine(batch.context, batch.control, camera, seeds)
+            values = {"sums": batch.sums(frames, nets.get("lpips_alex"))}
+            if "fvd" in nets:
+                values["logits"] = nets["fvd"].features(_joined(batch.context, frames))
+            if SRC in nets:
+                control = there_and_back(batch.control[:, :half])
+                whole = jax.tree.map(
+                    lambda a, b: np.concatenate([a[:, -1:], b], 1), batch.context.camera, camera
+                )
+                there = jax.tree.map(lambda x: _there_and_back(x, half)[:, 1:], whole)
+                walk = _joined(batch.context, imagine(batch.context, control, there, seeds))
+                values["src"] = np.asarray(nets[SRC](walk, walk))
+            if "dreamsim" in nets:
+                truth = _signal(batch.targets.rgb_THWC)
+                values["dreamsim"] = np.asarray(nets["dreamsim"](frames.rgb_THWC, truth))
+            return values
+
+        found, took = self._over_batches(label, score)
+        self.log(took)
+        return found
 
 
 def open_scorer(
@@ -219,11 +212,8 @@ def open_scorer(
 ) -> Scorer:
     """Fix the protocol before training, and read its clips.
 
-    Args:
-        config: the settings that all rows share.
-        out: the folder of the table; its ``protocol.json`` is written or, if it exists, used.
-        log: prints a line.
-        weights: metric → its file or folder of weights, for those that ship with no package.
+    The ``protocol.json`` of the table's folder is written or, if it exists, used. ``weights`` are
+    by metric its file or folder, for those that ship with no package.
 
     Raises:
         UserError: the data are missing or have changed, or the folder contains another protocol.
@@ -260,19 +250,17 @@ def _measures(
     nets, left_out = load_all(NETWORKS, weights)
     clip = config.model.clip
     small = min(clip.height, clip.width) < LEAST["alex"]
-    for name in ("lpips_alex", SRC) if small else ():
-        if nets.pop(name, None) is not None:
-            size = f"{LEAST['alex']} pixels each way and these have {clip.width} × {clip.height}"
-            left_out[name] = f"{name} is left out: AlexNet needs images of {size}."
-    if clip.frames % 2 == 0 and nets.pop(SRC, None) is not None:
-        left_out[SRC] = f"{SRC} is left out: a walk half as far and back needs an odd clip.frames."
-    for name in ("fvd", "kvd") if clip.frames < SHORTEST else ():
-        if nets.pop(name, None) is not None:
-            size = f"{SHORTEST} frames or more, and these have {clip.frames}"
-            left_out[name] = f"{name} is left out: I3D needs clips of {size}."
-    for name in ("fvd", "kvd") if clips < 2 else ():
-        if nets.pop(name, None) is not None:
-            left_out[name] = f"{name} is left out: it compares sets, and there is one clip."
+    size = f"{LEAST['alex']} pixels each way and these have {clip.width} × {clip.height}"
+    short = f"{SHORTEST} frames or more, and these have {clip.frames}"
+    for names, unsuitable, why in (
+        (("lpips_alex", SRC), small, f"AlexNet needs images of {size}"),
+        ((SRC,), clip.frames % 2 == 0, "a walk half as far and back needs an odd clip.frames"),
+        (("fvd", "kvd"), clip.frames < SHORTEST, f"I3D needs clips of {short}"),
+        (("fvd", "kvd"), clips < 2, "it compares sets, and there is one clip"),
+    ):
+        for name in names if unsuitable else ():
+            if nets.pop(name, None) is not None:
+                left_out[name] = f"{name} is left out: {why}."
     return nets, left_out
 
 
@@ -311,12 +299,8 @@ they are omitted from the name."""
 def recorded_path(study: Study, row: Row, seed: int, steps: Mapping[str, int], scored: str) -> Path:
     """Return the file of a row's scores.
 
-    Args:
-        study: settings shared by all rows.
-        row: the row.
-        seed: training seed.
-        steps: name of a row or backbone → number of steps.
-        scored: hash of the protocol and the metrics (``Scorer.name``).
+    ``steps`` are by name of a row or backbone, ``scored`` is the hash of the protocol and the
+    metrics (``Scorer.name``).
     """
     start = study.base.train.start
     facts: list[Any] = [
@@ -356,23 +340,10 @@ def read_recorded(file: Path) -> dict[str, Arrays] | None:
 
 def write_recorded(file: Path, found: Mapping[str, Arrays]) -> None:
     """Write scores (row → metric → values), unless the file already contains them."""
-    if _equal(read_recorded(file), found):
-        return
-    flat = {
-        f"{name}:{measure}": values
-        for name, arrays in found.items()
-        for measure, values in arrays.items()
-    }
-    ResultCache(file.parent, COMPRESSED).put(file.stem, flat)
-
-
-def _equal(stored: Mapping[str, Arrays] | None, found: Mapping[str, Arrays]) -> bool:
-    if stored is None or stored.keys() != found.keys():
-        return False
-    return all(
-        stored[name].keys() == found[name].keys()
-        and all(
-            np.array_equal(stored[name][k], found[name][k], equal_nan=True) for k in found[name]
-        )
-        for name in found
-    )
+    flat = {f"{name}:{k}": x for name, arrays in found.items() for k, x in arrays.items()}
+    cache = ResultCache(file.parent, COMPRESSED)
+    stored = cache.get(file.stem) or {}
+    if stored.keys() != flat.keys() or not all(
+        np.array_equal(stored[key], values, equal_nan=True) for key, values in flat.items()
+    ):
+        cache.put(file.stem, flat)

@@ -37,7 +37,7 @@ from pewm_jax.io.store import file_hash, inputs_hash, make_once
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.nn import target
-from pewm_jax.studies.table1_rows import Row
+from pewm_jax.studies.table1_rows import Row, as_kind
 from pewm_jax.train import loop, sharding
 from pewm_jax.train.runs import WEIGHTS
 from pewm_jax.train.step import compile_step, initial_state, noise_key
@@ -52,8 +52,6 @@ class Study:
     """Settings shared by all trainings of a table.
 
     Attributes:
-        base: the settings, including the data folder.
-        out: the output folder.
         minutes: processor minutes of training steps: a backbone's, and a row's.
         steps: numbers of steps instead of minutes, for both; None for equal time.
     """
@@ -80,32 +78,16 @@ class Study:
 
 
 def backbone_of(base: Config, row: Row) -> Row:
-    """Return the backbone that a row starts from, as a row: without a memory, with its depth.
-
-    Args:
-        base: the settings that all rows share; rows of equal depth have the same backbone.
-        row: the row.
-    """
-    given = {
-        field.name: getattr(base.model.memory, field.name)
-        for field in dataclasses.fields(NoMemoryConfig)
-    }
+    """Return the backbone that a row starts from, as a row: without a memory, with its depth."""
     name = "backbone" if row.depth else "backbone-without_depth"
-    return Row(name, NoMemoryConfig(**given), depth=row.depth)
+    return Row(name, as_kind(base.model.memory, NoMemoryConfig), depth=row.depth)
 
 
 def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Config:
-    """Return the settings of one training.
+    """Return the settings of one training of a row, or of its backbone, from the weights ``start``.
 
     A continued backbone gets the clips that the readers of this seed get, not those of its backbone
     again: clips are selected by the seed and the stage's number.
-
-    Args:
-        study: shared settings.
-        row: the row, or its backbone.
-        seed: training seed.
-        steps: number of steps of the only trained stage.
-        start: the weights to start from.
     """
     base = study.base
     clip = dataclasses.replace(base.model.clip, depth=row.depth)
@@ -129,17 +111,9 @@ def settings(study: Study, row: Row, seed: int, steps: int, *, start: str) -> Co
 
 
 def train(study: Study, row: Row, seed: int, steps: Mapping[str, int], log: Log) -> Config:
-    """Train a row and its backbone, unless they are trained already.
+    """Train a row and its backbone, unless they are trained already; return the row's settings.
 
-    Args:
-        study: shared settings.
-        row: the row.
-        seed: training seed.
-        steps: from ``planned``: name of a row or backbone → number of steps.
-        log: prints a line.
-
-    Returns:
-        The settings of the row's training, whose folder is ``train.run``.
+    ``steps`` are those of ``planned``, by name of a row or backbone. The folder is ``train.run``.
 
     Raises:
         UserError: the data do not fit, or a loss is not finite.
@@ -194,8 +168,7 @@ def _require_same(config: Config) -> None:
         what = " and ".join(name for name in now if now[name] != before.get(name))
         raise UserError(
             f"{run} was made from other weights or data ({what}) than the present ones: delete it, "
-            "or "
-            "choose another folder by --out."
+            "or choose another folder by --out."
         )
 
 
@@ -228,12 +201,10 @@ Times = dict[str, float]
 
 
 def planned(study: Study, rows: Sequence[Row], log: Log) -> dict[str, Any]:
-    """Return the number of steps of each row and its backbone; measured once.
+    """Return the time and the number of steps of each row and its backbone.
 
-    Trainings timed later are timed together with one that was timed before, and scaled by it.
-
-    Returns:
-        By name: ``seconds`` per step, None for equal steps; and ``steps``.
+    ``seconds`` per step are None for equal steps. Trainings timed later are timed together with one
+    that was timed before, and scaled by it.
 
     Raises:
         UserError: ``plan.json`` is damaged.
@@ -272,16 +243,15 @@ def _step_times(study: Study, models: dict[str, Row], log: Log) -> Times:
 
 
 def _read_times(path: Path) -> Times:
+    if not path.exists():
+        return {}
     try:
         kept = json.loads(path.read_text("utf-8"))
         return {str(model): float(seconds) for model, seconds in kept.items()}
-    except FileNotFoundError:
-        return {}
     except (ValueError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} is damaged ({error}), but it defines the lengths of trainings: restore it, or "
-            "use "
-            "another folder by --out."
+            "use another folder by --out."
         ) from None
 
 

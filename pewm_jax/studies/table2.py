@@ -1,6 +1,7 @@
 """Table 2 by one command: does a world model improve decisions, and does its memory?
 
-Every method gets the same tasks. Every decision is a file, so the same command resumes.
+Every method gets the same tasks. Every decision is a file, so the same command resumes. The table
+is written as Markdown, LaTeX and CSV, with the curve of planning and videos of plans.
 """
 
 from __future__ import annotations
@@ -10,14 +11,16 @@ import datetime as dt
 import functools
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
+from pewm_jax import worlds
 from pewm_jax.config import Config, UserError
-from pewm_jax.eval import intervals
+from pewm_jax.eval import statistics
 from pewm_jax.eval.loaded_run import LoadedRun, has_memory, open_run
 from pewm_jax.io import atomic
 from pewm_jax.io.progress import Meter
@@ -25,15 +28,42 @@ from pewm_jax.io.store import TABLE, ResultCache, require_same_inputs
 from pewm_jax.planning import scores
 from pewm_jax.planning.costs import FrameCost
 from pewm_jax.planning.settings import PlanConfig
-from pewm_jax.studies import deciders, table2_page
+from pewm_jax.report.charts import METHOD_COLOURS, Line, LineChart
+from pewm_jax.report.page import write_study
+from pewm_jax.report.table import Cell, Table, score_cells
+from pewm_jax.report.video import encode_h264, side_by_side
+from pewm_jax.studies import deciders
 from pewm_jax.studies.deciders import Policy, Predictors
-from pewm_jax.studies.goals import Goal, open_goal
+from pewm_jax.studies.goals import Goal, goal_of
 from pewm_jax.types import Params
 
 WITHIN_M, WITHIN_DEG = 0.35, 45.0
 """Distance and heading difference within which a goal counts as reached: one step of 0.25 m or one
 turn of 30° short of it."""
 Log = Callable[[str], Any]
+COLUMNS: Mapping[str, tuple[str, int]] = {
+    "ate": ("ATE, m", 3),
+    "rpe": ("RPE, m", 3),
+    "position_error": ("final position, m", 3),
+    "yaw_error": ("final heading, °", 1),
+    "sim": ("SIM, %", 1),
+    "success": ("success, %", 1),
+    "spl": ("SPL, %", 1),
+}
+"""Score → heading, decimals."""
+PAPER = (
+    ("NoMaD", 4.94, 4.86, 36.8),
+    ("NWM × 8", 4.82, 3.62, 59.7),
+    ("PEWM × 8", 4.80, 3.58, 62.5),
+    ("NWM × 16", 4.54, 3.51, 68.7),
+    ("PEWM × 16", 4.47, 3.28, 70.8),
+    ("PEWM, MPC", None, None, 87.5),
+)
+"""The paper's Table 2 (arXiv 2505.05495): ATE, RPE, SIM; MPC after about 720 samples."""
+NOT_COMPARABLE = (
+    "The paper specifies neither the distance of its goals nor its SIM; its policy is a NoMaD "
+    "trained on its own walks. Only the order of the rows can be compared."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,12 +71,9 @@ class Table2Config:
     """The settings of a table.
 
     Attributes:
-        tasks: number of tasks.
         houses: number of held-out houses, which tasks use in turn.
         proposals: numbers of a policy's proposals that are ranked.
         plan: settings of the planner.
-        policy: name of the policy.
-        cost: name of the cost.
         videos: number of tasks shown as videos.
         multiples: distances of goals, in multiples of ``plan.actions`` actions.
         none: a run that was trained without memory, or "".
@@ -73,13 +100,8 @@ def run(
 ) -> Path:
     """Run every method on every task, and write the table.
 
-    Args:
-        model: a run folder, or the name of weights that ship with the library.
-        out: the output folder.
-        study: the settings.
-        policy: the policy named in ``study``.
-        cost: the cost named in ``study``.
-        log: prints a line.
+    ``model`` is a run folder, or the name of weights that ship with the library; ``policy`` and
+    ``cost`` are those named in ``study``.
 
     Returns:
         The path of the table in Markdown; in the same folder .tex, .csv, .png, videos and
@@ -123,7 +145,8 @@ def run(
                     if name == "policy" and times > 1:
                         meter.advance(1)
                         continue
-                    goal = goal or _goal(study, config, number, times)
+                    far = times * study.plan.actions
+                    goal = goal or goal_of(config, number, study.houses, far)
                     decide = functools.partial(
                         _decide_and_score, name, goal, predictors, policy, cost, study
                     )
@@ -140,14 +163,13 @@ def run(
             for actions, found in by_distance.items()
         },
         "about": about
-        | {"date": dt.datetime.now(dt.UTC).date().isoformat(), "how": intervals.how()}
+        | {"date": dt.datetime.now(dt.UTC).date().isoformat(), "how": statistics.interval_facts()}
         | {"within_m": WITHIN_M, "within_deg": WITHIN_DEG, "model": str(model)},
     }
-    text = json.dumps(results, indent=1, allow_nan=False)
-    atomic.write_text(out / "results.json", text + "\n")
+    atomic.write_text(out / "results.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
     videos = _videos(out, study, config, params, made)
     page = out / "table2.md"
-    table2_page.write(results, page, videos)
+    write_page(results, page, videos)
     return page
 
 
@@ -174,17 +196,6 @@ def _require_alike(none: LoadedRun, opened: LoadedRun, name: str, model: str | P
         raise UserError(
             f"{name} has other clips or actions than {model}: train it with the same settings."
         )
-
-
-def _goal(study: Table2Config, config: Config, number: int, times: int = 1) -> Goal:
-    return open_goal(
-        number,
-        houses=study.houses,
-        actions=times * study.plan.actions,
-        context=config.data.context,
-        motion=config.model.actions,
-        size=config.model.clip.height,
-    )
 
 
 def _decide_and_score(
@@ -229,9 +240,8 @@ def _scored(goal: Goal, actions_N: np.ndarray) -> dict[str, float]:
 
 def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Return means over houses with intervals, what memory adds, paired by task, and curves."""
-    houses = np.unique([each["house"] for each in next(iter(made.values()))], return_inverse=True)[
-        1
-    ]
+    named = [each["house"] for each in next(iter(made.values()))]
+    houses = np.unique(named, return_inverse=True)[1]
     values = {
         name: {m: np.array([one["scores"][m] for one in each]) for m in each[0]["scores"]}
         for name, each in made.items()
@@ -241,19 +251,16 @@ def summary(made: Mapping[str, list[dict[str, Any]]]) -> dict[str, Any]:
         what, _, predictor = name.partition("-")
         if predictor == "memory":
             other = values[f"{what}-empty"]
-            memory[what] = {
-                m: intervals.entry(values[name][m] - other[m], houses) for m in values[name]
-            }
+            gains = {m: x - other[m] for m, x in values[name].items()}
+            memory[what] = statistics.entries(gains, houses)
     curves = {}
     for name, each in made.items():
         if each[0]["curve"]:
-            curves[name] = {
-                n: intervals.entry(np.array([one["curve"][n] for one in each]), houses)
-                for n in each[0]["curve"]
-            }
+            sims = {n: np.array([one["curve"][n] for one in each]) for n in each[0]["curve"]}
+            curves[name] = statistics.entries(sims, houses)
     return {
         "rows": {
-            name: {m: intervals.entry(x, houses) for m, x in by.items()}
+            name: statistics.entries(by, houses)
             | {"seconds": float(np.median([one["seconds"] for one in made[name]]))}
             for name, by in values.items()
         },
@@ -277,7 +284,158 @@ def _videos(
         actions = np.array(made["mpc-memory"][number]["actions"])
         file = out / f"plan{number}.mp4"
         if not file.exists():
-            goal = _goal(study, config, number)
-            table2_page.video(file, goal, config, params, actions)
+            goal = goal_of(config, number, study.houses, study.plan.actions)
+            _write_video(file, goal, config, params, actions)
         files.append(file)
     return files
+
+
+def _write_video(
+    file: Path, goal: Goal, config: Config, params: Params, actions_N: np.ndarray
+) -> None:
+    """Write the imagined plan, the real frames, and the walk to the goal, side by side."""
+    state = worlds.start(config, params, goal.context)
+    imagined = worlds.imagine(
+        config, params, state, actions_N.astype(np.int32), jax.random.key(goal.number)
+    )[1]
+    happened = goal.simulator.frames(goal.walked(actions_N)[1:])
+    expert = goal.simulator.frames(goal.walk_T3[1:])
+    count = len(actions_N)
+    target = np.repeat(goal.frame.rgb_THWC, count, 0), np.repeat(goal.frame.depth_THW, count, 0)
+    columns = [
+        ("goal", *target),
+        ("planned", np.asarray(imagined.rgb_THWC), np.asarray(imagined.depth_THW)),
+        ("happened", happened.rgb_THWC, happened.depth_THW),
+        ("the walk to the goal", expert.rgb_THWC, expert.depth_THW),
+    ]
+    footers = [f"{goal.house}, action {step + 1} of {count}" for step in range(count)]
+    frames = side_by_side(columns, footers, far_m=8.0)
+    with atomic.replacing(file) as partial:
+        partial.write_bytes(encode_h264(frames, 2))
+
+
+def write_page(results: Mapping[str, Any], page: Path, videos: Sequence[Path]) -> None:
+    """Write the table as ``page`` (Markdown) and, beside it, .tex, .csv and .png."""
+    text, table = markdown(results, page.stem, videos), scores_table(results)
+    write_study(page, text, table, numbers_table(results), chart(results))
+
+
+def label(name: str) -> str:
+    """Return a method's display name."""
+    what, _, predictor = name.partition("-")
+    words = {
+        "empty": "the model, empty memory",
+        "none": "a model trained without memory",
+        "reproject": "reprojection, no network",
+        "memory": "the model with its memory",
+        "truth": "the renderer itself",
+    }
+    if what == "policy":
+        return "policy alone"
+    if what == "mpc":
+        return f"one plan, open loop · {words[predictor]}"
+    if what == "loop":
+        return f"MPC, closed loop · {words[predictor]}"
+    return f"ranking × {what.removeprefix('rank')} · {words[predictor]}"
+
+
+def scores_table(results: Mapping[str, Any], *, seconds: bool = False) -> Table:
+    """Return the scores of one distance, with the time per decision if asked."""
+    header = ["method", *(heading for heading, _ in COLUMNS.values())]
+    rows = [
+        [
+            label(name),
+            *score_cells(COLUMNS, found),
+            *([Cell(found["seconds"])] if seconds else []),
+        ]
+        for name, found in results["rows"].items()
+    ]
+    return Table.of([*header, *(["seconds"] if seconds else [])], rows)
+
+
+def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> str:
+    """Return the page."""
+    headings = [heading for heading, _ in COLUMNS.values()]
+    gains = [
+        [
+            label(f"{what}-memory").split(" · ", maxsplit=1)[0],
+            *score_cells(COLUMNS, entries, sign=True),
+        ]
+        for what, entries in results["memory_minus_empty"].items()
+    ]
+    theirs = [
+        [name, *("–" if value is None else f"{value:g}" for value in values)]
+        for name, *values in PAPER
+    ]
+    parts = [
+        "# Table 2: does a world model help to decide, and does its memory?",
+        _how(results),
+        scores_table(results, seconds=True).markdown(),
+        *_farther(results),
+        "## What the memory adds\n\nWith memory minus empty, paired by task, 95 % intervals over "
+        "houses; for errors lower is better.\n\n"
+        + Table.of(["method", *headings], gains).markdown(),
+        f"## The curve of planning\n\n![SIM against samples]({stem}.png)",
+        "## Beside the paper\n\n"
+        + Table.of(["", "ATE", "RPE", "SIM"], theirs).markdown()
+        + f"\n\n{NOT_COMPARABLE}",
+    ]
+    if videos:
+        shown = "\n".join(f"- [{video.name}]({video.name})" for video in videos)
+        parts.append(f"## Planned and happened\n\n{shown}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _farther(results: Mapping[str, Any]) -> list[str]:
+    """Return a section for each distance but the first."""
+    return [
+        f"## Goals {actions} actions away\n\n{scores_table(found, seconds=True).markdown()}"
+        for actions, found in list(results.get("distances", {}).items())[1:]
+    ]
+
+
+def _how(results: Mapping[str, Any]) -> str:
+    about, plan = results["about"], results["about"]["plan"]
+    return (
+        f"{about['model']}; {results['tasks']} tasks in {results['houses']} held-out houses; the "
+        f"goal is where a walk of {plan['horizon'] * plan['action_block']} actions ends. Policy: "
+        f"{about['policy']}; cost: {about['cost']} to the goal image; plans by CEM with "
+        f"{plan['candidates']} candidates, {plan['elites']} elites, {plan['rounds']} rounds. Open "
+        "loop: one plan, executed completely. Closed loop: after each clip's actions the agent "
+        "observes the real frames and plans the remaining actions again; at the end it may execute "
+        "one more clip if that lowers the predicted cost. ATE and RPE against that walk, "
+        "unaligned; SIM = 50 (max(0, 1 − remaining distance / distance) + 1 − heading error / π); "
+        f"success within {about['within_m']:g} m and {about['within_deg']:g}°. Means over houses; "
+        f"± is half of the 95 % interval (bootstrap over houses). {about['date']}."
+    )
+
+
+def numbers_table(results: Mapping[str, Any]) -> Table:
+    """Return every number, one line per method and score."""
+    rows = []
+    for name, found in results["rows"].items():
+        for score in COLUMNS:
+            ends = (found[score][end] for end in ("mean", "low", "high"))
+            rows.append([name, score, *("" if end is None else f"{end:.6g}" for end in ends)])
+    return Table.of(["method", "score", "mean", "low", "high"], rows)
+
+
+def chart(results: Mapping[str, Any]) -> LineChart:
+    """Return SIM against samples for each predictor, with 95 % intervals."""
+    curves = results["curves"]
+    samples = sorted({int(count) for curve in curves.values() for count in curve})
+    lines = []
+    for name, curve in curves.items():
+        entries = [curve.get(str(count), {}) for count in samples]
+        mean, low, high = ([e.get(end) for e in entries] for end in ("mean", "low", "high"))
+        predictor = name.partition("-")[2]
+        text = label(name).split(" · ", maxsplit=1)[1]
+        lines.append(Line(text, METHOD_COLOURS[predictor], mean, low, high))
+    return LineChart(
+        "SIM of the best plan so far, %",
+        "samples",
+        lines,
+        x=samples,
+        label_lines=True,
+        size=(7.6, 4.0),
+    )

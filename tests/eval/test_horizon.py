@@ -11,7 +11,6 @@ from pewm_jax.errors import ConfigError
 from pewm_jax.eval import horizon, voxel_trials
 from pewm_jax.models.persist import voxel_vae
 from pewm_jax.models.persist.config import VoxelVAEConfig
-from pewm_jax.report import horizon_page
 
 
 def test_stretches_are_of_their_frames_alone():
@@ -65,7 +64,7 @@ def test_the_report_says_what_was_measured(tmp_path):
         "edits": trials.facts(),
         "protocol": {"run": "runs/<tiny>"},
     }
-    page = horizon_page.write(tmp_path, facts, videos, (10, 20))
+    page = horizon.write_report(tmp_path, facts, videos, (10, 20))
     text = page.read_text()
     for wanted in (
         "11–20",
@@ -81,7 +80,7 @@ def test_the_report_says_what_was_measured(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {
         "horizon.html", "horizon.json", "horizon.mp4", "horizon.png",
     }  # fmt: skip
-    said = horizon_page.lines(facts, (10, 20))
+    said = horizon.lines(facts, (10, 20))
     assert said[0] == "PSNR in dB of frames 1–10, 11–20:"
     assert "20: FVD 12, KVD 0.50" in said[-3]
 

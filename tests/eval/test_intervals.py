@@ -8,17 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from pewm_jax.eval import intervals
-from pewm_jax.eval.intervals import (
+from pewm_jax.eval import statistics
+from pewm_jax.eval.statistics import (
     DRAWS,
     SEED,
     entry,
     holm,
+    house_table,
     over_houses,
     over_seeds,
     p_over_houses,
     p_over_seeds,
-    table,
 )
 from tests.eval.test_statistics import sums_of
 from tests.properties import examples
@@ -72,15 +72,15 @@ def test_intervals_move_and_stretch_with_the_values(seed, shift, scale):
 
 
 def test_it_holds_the_truth_about_as_often_as_it_says(monkeypatch):
-    monkeypatch.setattr(intervals, "DRAWS", 400)
-    intervals.drawn.cache_clear()
+    monkeypatch.setattr(statistics, "DRAWS", 400)
+    statistics.drawn.cache_clear()
     rng, held = np.random.default_rng(1), 0
     for _ in range(300):
         houses = np.repeat(np.arange(24), 3)
         values = rng.standard_normal(24)[houses] + 0.5 * rng.standard_normal(72)
         got = entry(values, houses)
         held += got["low"] < 0 < got["high"]
-    intervals.drawn.cache_clear()
+    statistics.drawn.cache_clear()
     assert 0.88 < held / 300 < 0.98
 
 
@@ -103,7 +103,7 @@ def test_differences_are_paired():
     # Clips differ wildly; the gain is 3 dB on each: the difference is certain, the scores are not.
     base = np.repeat(10.0 ** np.random.default_rng(3).uniform(-3, -1, (1, 10, 1)), 2, 0)
     sums = {"memory": sums_of(base / 10**0.3), "empty": sums_of(base), "copy": sums_of(base[:1])}
-    got = table(sums, np.repeat(np.arange(5), 2))
+    got = house_table(sums, np.repeat(np.arange(5), 2))
     for method in ("empty", "copy"):
         gain = got["margins"][method]["seen"]["psnr"]
         assert [gain[name] for name in ("mean", "low", "high")] == pytest.approx([3, 3, 3])

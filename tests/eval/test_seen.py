@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pewm_jax.eval import seen as masks
+from pewm_jax.eval.metrics import images as masks
 from pewm_jax.geometry.cameras import intrinsics_from_fov, pixel_grid, pose_from_yaw
 from pewm_jax.types import Camera, Frames
 from tests.properties import examples

@@ -16,7 +16,7 @@ from pewm_jax.config import ConfigError
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.encoders.simple import PatchColoursConfig
-from pewm_jax.eval.seen import seen_masks
+from pewm_jax.eval.metrics.images import seen_masks
 from pewm_jax.memory import interface as memories
 from pewm_jax.memory import rendering, surfels
 from pewm_jax.memory import rendering as views

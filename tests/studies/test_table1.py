@@ -29,7 +29,6 @@ from pewm_jax.models.lpips import model as lpips
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.studies import (
     table1,
-    table1_numbers,
     table1_page,
     table1_rows,
     table1_scoring,
@@ -245,7 +244,7 @@ def test_rows_have_about_the_same_parameters_and_the_same_extent():
         size = np.multiply(row.memory.cell_m, row.memory.cells)
         np.testing.assert_allclose(size, (32, 32, 16), atol=0.1)
     assert {row.paper for row in every if row.paper} == set(table1_page.PAPER)
-    assert set(table1_numbers.CHAIN) <= {row.name for row in every}
+    assert set(table1.CHAIN) <= {row.name for row in every}
 
 
 @pytest.mark.slow
@@ -339,7 +338,7 @@ def test_differences_are_paired_by_clip_and_seeds_are_averaged_first():
 
     noise = rng.normal(size=6)
     pieces = {"none": [arrays(1.0), arrays(1.1)], "images-attend": [arrays(1.2), arrays(1.3)]}
-    found = table1_numbers.summary(pieces, {}, houses, {})
+    found = table1.summary(pieces, {}, houses, {})
     gain = found["differences"]["none"]["images-attend"]["psnr/all"]
     assert gain["mean"] == pytest.approx(2)
     assert gain["low"] == pytest.approx(2)  # the same noise in both: paired away
@@ -347,7 +346,7 @@ def test_differences_are_paired_by_clip_and_seeds_are_averaged_first():
         found["rows"]["none"]["measures"]["psnr/all"]["per_seed"][0] + 1
     )
     assert table1_page.mark_of(gain) == "*"  # both seeds gain as much
-    apart = table1_numbers.summary(
+    apart = table1.summary(
         {"none": pieces["none"], "voxel-attend": [arrays(0.9), arrays(2.2)]}, {}, houses, {}
     )
     unsure = apart["differences"]["none"]["voxel-attend"]["psnr/all"]
@@ -408,7 +407,7 @@ def test_every_measure_of_the_table_stands_beside_what_it_can_be(measured):
 
     pieces = {name: [copied, copied] for name in ("none", "none-attend", "voxel-attend")}
     pieces |= {"copy": [copied]}
-    results = table1_numbers.summary(pieces, truth, judge.house_of_clip, judge.nets, judge.frames)
+    results = table1.summary(pieces, truth, judge.house_of_clip, judge.nets, judge.frames)
     row = results["rows"]["none"]["measures"]
     net = judge.nets["fvd"]
     assert row["fvd"]["mean"] == pytest.approx(net.distance(copied["logits"], truth["logits"]))
@@ -536,10 +535,10 @@ def test_marks_are_corrected_for_the_comparisons_of_a_column():
         ]
 
     alone = family()[1:2]
-    table1_numbers.adjust(alone)
+    table1.adjust(alone)
     assert table1_page.mark_of(alone[0]["psnr/seen"]) == "*"
     together = family()
-    table1_numbers.adjust(together)
+    table1.adjust(together)
     found = [each["psnr/seen"]["p_holm"] for each in together]
     assert found == pytest.approx([0.04, 0.06, 0.06, 0.2])
     assert [table1_page.mark_of(each["psnr/seen"]) for each in together] == ["*", "", "", ""]

@@ -129,14 +129,10 @@ def load(name: str, weights: Weights = None) -> Metric:
 def load_all(
     names: Iterable[str] = _COLOURS, weights: Mapping[str, str | Path] | None = None
 ) -> tuple[dict[str, Metric], dict[str, str]]:
-    """Return the metrics whose weights are available, and the reasons why the others are skipped.
+    """Return the metrics by name, and the reasons, as sentences, why others are skipped.
 
-    Args:
-        names: some of ``NAMES``; by default all that take colours.
-        weights: metric → file or folder of weights.
-
-    Returns:
-        ``(metrics, skipped)``: name → metric, and name → reason as a sentence.
+    A metric without available weights is skipped, unless they are given in ``weights``: metric →
+    file or folder.
 
     Raises:
         UserError: there is no such metric, or weights are missing, damaged, or given for a metric

@@ -1,8 +1,12 @@
-"""Image errors under masks: PSNR, SSIM, depth error.
+"""Image errors under masks: PSNR, SSIM, depth error; and the masks of pixels seen before.
 
 Errors are stored as *sums under masks* (``error_sums``), so one pass over the samples yields every
 table: per clip, per frame index, per mask, in any grouping. Colours are compared in [0, 1], after
 the networks' [−1, 1] is shifted and clipped.
+
+Seen-before masks say which pixels of a frame show surfaces that earlier frames have seen
+(``seen_masks``). They are exact up to the sampling of the images: a pixel's true 3D point is
+projected into each earlier frame and compared with that frame's true depth. No network is involved.
 """
 
 from __future__ import annotations
@@ -14,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import UserError
+from pewm_jax.geometry.cameras import project, unproject
 from pewm_jax.io import tree
-from pewm_jax.types import Array, Frames, Params
+from pewm_jax.types import Array, Camera, Frames, Params
 
 WINDOW, SIGMA = 11, 1.5
 """Size and standard deviation of SSIM's Gaussian window, pixels (Wang et al. 2004)."""
@@ -61,13 +66,9 @@ def _band(length: int) -> np.ndarray:
 def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
     """Return structural similarity per pixel (Wang et al. 2004, Eq. 13; K1 = .01, K2 = .03).
 
-    Args:
-        a_HWC: (..., H, W, 3) colours in [0, 1], H and W at least 11.
-        b_HWC: the same shape.
-
-    Returns:
-        (..., H − 10, W − 10), averaged over colours: only pixels whose whole 11 × 11 Gaussian
-        window lies in the image have a value, as in the original. Its mean is the usual SSIM.
+    Both are (..., H, W, 3) colours in [0, 1], H and W at least 11. The result, (..., H − 10, W −
+    10), is averaged over colours: only pixels whose whole 11 × 11 Gaussian window lies in the image
+    have a value, as in the original. Its mean is the usual SSIM.
     """
     height, width = a_HWC.shape[-3:-1]
     rows, columns = jnp.asarray(_band(height)), jnp.asarray(_band(width))
@@ -88,18 +89,11 @@ def ssim_map(a_HWC: Array, b_HWC: Array) -> Array:
 
 
 def error_sums(predicted: Frames, true: Frames, seen_THW: Array, unseen_THW: Array) -> Array:
-    """Sum the errors of imagined frames under each mask.
+    """Sum the errors of T imagined frames under each mask of pixels seen before or never seen.
 
-    Args:
-        predicted: T imagined frames.
-        true: T recorded frames of the same size.
-        seen_THW: (T, H, W) bool, pixels whose surface was seen before.
-        unseen_THW: (T, H, W) bool, pixels whose surface was never seen.
-
-    Returns:
-        (T, 3, 9): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
-        pixels whose window lies inside the image. Depth counts pixels with both a true and a
-        predicted depth (a copied frame may have holes).
+    Returns (T, 3, 9): for every frame and every mask of ``MASKS`` the sums of ``SUMS``. SSIM counts
+    pixels whose window lies inside the image. Depth counts pixels with both a true and a predicted
+    depth (a copied frame may have holes).
     """
     guess, truth = unit_colours(predicted.rgb_THWC), unit_colours(true.rgb_THWC)
     squared_THW = ((guess - truth) ** 2).sum(-1)
@@ -131,16 +125,77 @@ error_sums_batch = jax.jit(jax.vmap(error_sums))
 
 
 def with_lpips(sums: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Return sums with LPIPS, which is defined for whole images: only under the mask ``all``.
-
-    Args:
-        sums: (..., T, 3, 9) from ``error_sums``.
-        distances: (..., T) LPIPS of every frame.
-    """
+    """Return sums (..., T, 3, 9) with LPIPS (..., T), of whole images: only under ``all``."""
     sums = np.array(sums)
     sums[..., MASKS.index("all"), SUMS.index("lpips")] = distances
     sums[..., MASKS.index("all"), SUMS.index("pictures")] = 1
     return sums
+
+
+TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.03
+"""Two depths of one surface agree within the larger of 5 cm and 3 %."""
+
+
+def _agrees(depth_P: Array, z_P: Array) -> Array:
+    close = jnp.maximum(TOLERANCE_M, TOLERANCE_RELATIVE * z_P)
+    return (depth_P > 0) & (jnp.abs(depth_P - z_P) <= close)
+
+
+def visible_in(points_world_P3: Array, depth_HW: Array, camera: Camera) -> Array:
+    """Return which points (P,) are visible in a depth image.
+
+    A point is visible if it projects inside the image, in front of the camera, and its depth agrees
+    with the image there: either with the nearest pixel, or with 1/depth interpolated between the
+    four surrounding pixels. (On a plane 1/depth is linear in the image. So a floor seen at a
+    grazing angle is recognised, although its depth changes by more than the tolerance from row to
+    row.) Depths are z, metres; 0 = no measurement.
+    """
+    height, width = depth_HW.shape
+    uv, z = project(points_world_P3, camera)
+    u, v = uv[:, 0], uv[:, 1]
+    inside = (z > 1e-3) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+
+    # One gather for the four pixels around a point, which include the nearest.
+    padded = jnp.pad(depth_HW, 1, mode="edge")
+    four = [padded[i : i + height + 1, j : j + width + 1] for i in (0, 1) for j in (0, 1)]
+    left, top = jnp.floor(u - 0.5), jnp.floor(v - 0.5)
+    across, down = u - 0.5 - left, v - 0.5 - top
+    row = jnp.clip(top + 1, 0, height).astype(jnp.int32)
+    column = jnp.clip(left + 1, 0, width).astype(jnp.int32)
+    corners = jnp.moveaxis(jnp.stack(four, -1)[row, column], -1, 0)
+    upper, lower = (jnp.where(across < 0.5, corners[i], corners[i + 1]) for i in (0, 2))
+    nearest = jnp.where(down < 0.5, upper, lower)
+    weights = jnp.stack(
+        [(1 - down) * (1 - across), (1 - down) * across, down * (1 - across), down * across]
+    )
+    measured = (corners > 0).all(0)
+    inverse = (weights / jnp.where(corners > 0, corners, 1)).sum(0)
+    between = jnp.where(measured, 1 / inverse, 0)
+    return inside & (_agrees(nearest, z) | _agrees(between, z))
+
+
+def seen_masks(target: Frames, context: Frames) -> tuple[Array, Array]:
+    """Return the bool masks ``(seen_THW, unseen_THW)`` of the pixels seen before and never seen.
+
+    Both arguments have true depth and poses. A pixel without depth is in neither.
+    """
+    depth_THW = jnp.asarray(target.depth_THW)
+    points = unproject(depth_THW, target.camera).reshape(-1, 3)
+
+    def look(seen_P, frame):
+        depth_HW, camera = frame
+        return seen_P | visible_in(points, depth_HW, camera), None
+
+    none = jnp.zeros(points.shape[0], bool)
+    frames = (jnp.asarray(context.depth_THW), jax.tree.map(jnp.asarray, context.camera))
+    seen_P, _ = jax.lax.scan(look, none, frames)
+    measured = depth_THW > 0
+    seen_THW = seen_P.reshape(depth_THW.shape) & measured
+    return seen_THW, measured & ~seen_THW
+
+
+seen_masks_batch = jax.jit(jax.vmap(seen_masks))
+"""``seen_masks`` over a batch of clips."""
 
 
 class Metric(Protocol):
@@ -162,11 +217,8 @@ class Metric(Protocol):
 def name_with_hash(network: str, params: Params, published: str) -> str:
     """Return a network's name, with 8 digits of the hash of weights that are not published.
 
-    Args:
-        network: its name.
-        params: its weights.
-        published: ``tree.digest`` of the published weights, which is independent of the file
-            format.
+    ``published`` is ``tree.digest`` of the published weights, which is independent of the file
+    format.
     """
     digest = tree.digest(params)
     return network if digest == published else f"{network}-{digest[:8]}"
@@ -229,11 +281,8 @@ PLAIN: dict[str, Metric] = {"psnr": clip_psnr, "ssim": clip_ssim}
 def clip_depth_mae(imagined_BTHW: Array, truth_BTHW: Array) -> Array:
     """Return the mean absolute error, m, (B,), where both have a depth; NaN if none has.
 
-    A clip with an imagined depth that is not finite has no score: NaN.
-
-    Args:
-        imagined_BTHW: (B, T, H, W) or (B, T, H, W, 1) depths along the optical axis, m; 0 for none.
-        truth_BTHW: the same shape.
+    Both are (B, T, H, W) or (B, T, H, W, 1) depths along the optical axis, m; 0 for none. A clip
+    with an imagined depth that is not finite has no score: NaN.
 
     Raises:
         UserError: the clips differ in shape, or are not floats.

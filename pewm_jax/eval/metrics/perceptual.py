@@ -7,11 +7,13 @@ import functools
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.images import colours, name_with_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.dreamsim import convert as dreamsim_weights
 from pewm_jax.models.dreamsim import model as dreamsim
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -34,12 +36,8 @@ PACKAGED: dict[str, Net] = {"alex": "alex", "vgg": "vgg"}
 class LPIPS:
     """LPIPS with its weights; a ``Metric``.
 
-    Attributes:
-        net: the network.
-        params: its parameters.
-        sha256: hash of the weights file.
-        encoder: the network's name, with a hash for weights other than the package's
-            (``alex-1a2b3c4d``).
+    ``sha256`` is the hash of the weights file; ``encoder`` the network's name, with a hash for
+    weights other than the package's (``alex-1a2b3c4d``).
     """
 
     net: Net
@@ -64,11 +62,7 @@ class LPIPS:
     def towards(self, truth_BTHWC: Array) -> Callable[[Array], Array]:
         """Return ``frames`` with a fixed ground truth, which passes through the network only once.
 
-        Args:
-            truth_BTHWC: as for ``Metric``.
-
-        Returns:
-            ``imagined_BTHWC -> distances (B, T)``, which raises the same errors as ``frames``.
+        ``imagined_BTHWC -> distances (B, T)`` raises the same errors as ``frames``.
         """
         made = jax.eval_shape(self.described, truth_BTHWC)
         if sum(x.size * x.dtype.itemsize for x in made) > KEPT:
@@ -99,26 +93,22 @@ class LPIPS:
 @functools.partial(jax.jit, static_argnums=0)
 def _distances(net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Array) -> Array:
     """Compare colours in [0, 1], frame by frame."""
-    clips, frames, height, width, _ = imagined_BTHWC.shape
-    pairs = tuple(
-        2 * x.reshape(clips * frames, height, width, 3) - 1 for x in (imagined_BTHWC, truth_BTHWC)
-    )
 
     def one(pair: tuple[Array, Array]) -> Array:
         return lpips.apply(net, params, pair[0][None], pair[1][None])[0]
 
-    return jax.lax.map(one, pairs, batch_size=_batch_size(pairs[0])).reshape(clips, frames)
+    found = _map_images(one, (_signals(imagined_BTHWC), _signals(truth_BTHWC)))
+    return found.reshape(imagined_BTHWC.shape[:2])
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _describe(net: Net, params: Params, truth_BTHWC: Array) -> tuple[Array, ...]:
     """Return the features of colours in [0, 1]; the image axis comes first."""
-    pictures = 2 * truth_BTHWC.reshape(-1, *truth_BTHWC.shape[2:]) - 1
 
-    def one(picture: Array) -> tuple[Array, ...]:
-        return tuple(x[0] for x in lpips.describe(net, params, picture[None]))
+    def one(images: tuple[Array]) -> tuple[Array, ...]:
+        return tuple(x[0] for x in lpips.describe(net, params, images[0][None]))
 
-    return jax.lax.map(one, pictures, batch_size=_batch_size(pictures))
+    return _map_images(one, (_signals(truth_BTHWC),))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -126,48 +116,38 @@ def _distances_to_features(
     net: Net, params: Params, imagined_BTHWC: Array, truth: tuple[Array, ...]
 ) -> Array:
     """Compare colours in [0, 1] with precomputed features."""
-    clips, frames = imagined_BTHWC.shape[:2]
-    pictures = 2 * imagined_BTHWC.reshape(-1, *imagined_BTHWC.shape[2:]) - 1
 
     def one(pair: tuple[Array, tuple[Array, ...]]) -> Array:
         mine = lpips.describe(net, params, pair[0][None])
         return lpips.distance(params, mine, [x[None] for x in pair[1]])[0]
 
-    found = jax.lax.map(one, (pictures, truth), batch_size=_batch_size(pictures))
-    return found.reshape(clips, frames)
+    return _map_images(one, (_signals(imagined_BTHWC), truth)).reshape(imagined_BTHWC.shape[:2])
 
 
-def _batch_size(pictures_NHWC: Array) -> int:
-    return max(1, PIXELS // (pictures_NHWC.shape[1] * pictures_NHWC.shape[2]))
+def _signals(clips_BTHWC: Array) -> Array:
+    """Return the images of clips with colours in [0, 1] as signals in [−1, 1], (B T, H, W, 3)."""
+    return 2 * clips_BTHWC.reshape(-1, *clips_BTHWC.shape[2:]) - 1
+
+
+def _map_images(function: Callable[[Any], Any], images: tuple[Any, ...]) -> Any:
+    """Apply a function to images and what belongs to them, a bounded number at once."""
+    at_once = max(1, PIXELS // (images[0].shape[1] * images[0].shape[2]))
+    return jax.lax.map(function, images, batch_size=at_once)
 
 
 def read_lpips(path: Path, net: Net | None = None) -> LPIPS:
-    """Read LPIPS from a file of weights.
-
-    Args:
-        path: the file.
-        net: the required network; by default the file's.
-
-    Raises:
-        UserError: see ``models.lpips.convert.read``.
-    """
+    """Read LPIPS from a file of weights; see ``models.lpips.convert.read``."""
     found, params = lpips_weights.read(path, net)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     name = name_with_hash(found, params, lpips_weights.PUBLISHED[found])
-    return LPIPS(found, jax.device_put(params), digest, name)
+    return LPIPS(found, jax.device_put(params), file_hash(path), name)
 
 
 def select_lpips(setting: str, height: int, width: int) -> tuple[LPIPS | None, str]:
-    """Return the LPIPS that a setting selects, and a description or the reason for None.
-
-    Args:
-        setting: ``evaluate.lpips``.
-        height: height of the scored images, pixels.
-        width: width of the scored images, pixels.
+    """Return the LPIPS that ``evaluate.lpips`` selects, and a description or the reason for None.
 
     Raises:
-        UserError: explicitly requested weights are missing, damaged, or unsuitable for such images.
+        UserError: explicitly requested weights are missing, damaged, or unsuitable for images of
+            ``height`` × ``width`` pixels.
     """
     if setting == OFF:
         return None, "LPIPS is not measured (evaluate.lpips)."
@@ -197,12 +177,7 @@ PICTURES = 8
 
 @dataclasses.dataclass(frozen=True)
 class DreamSim:
-    """DreamSim's distance, averaged over a clip's frames; a ``Metric``, lower is better.
-
-    Attributes:
-        params: parameters of the three encoders.
-        sha256: hash of them.
-    """
+    """DreamSim's distance, averaged over a clip's frames; a ``Metric``, lower is better."""
 
     params: Params = dataclasses.field(repr=False)
     sha256: str = ""

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import hashlib
 from pathlib import Path
 
 import jax
@@ -25,6 +24,7 @@ import jax.numpy as jnp
 
 from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.images import Metric, colours, name_with_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.dinov2 import model as dinov2
 from pewm_jax.models.dinov2.config import DINOv2Config, size_name
 from pewm_jax.models.lpips import convert as lpips_weights
@@ -58,12 +58,7 @@ class RevisitScore:
 
 @dataclasses.dataclass(frozen=True)
 class Revisit:
-    """Compares the return path with the way out; a ``Metric``.
-
-    Attributes:
-        name: name of the metric, including the encoder or the image metric.
-        compare: the image metric.
-    """
+    """Compares the return path with the way out by an image metric; a ``Metric``."""
 
     name: str
     compare: Metric
@@ -84,10 +79,7 @@ class Revisit:
     def score(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> RevisitScore:
         """Return the scores of imagined clips with floor and ceiling.
 
-        Args:
-            imagined_BTHWC: (B, T, H, W, 3), B ≥ 2 clips of different places, frame k and T − 1 − k
-                from one camera; see ``Metric``.
-            truth_BTHWC: the same shape.
+        There must be two clips or more, of different places, frame k and T − 1 − k from one camera.
 
         Raises:
             UserError: the clips differ in shape, have no way out and back, or there is only one.
@@ -105,10 +97,8 @@ class Revisit:
 def ways(clips_BTHWC: Array) -> tuple[Array, Array]:
     """Return the way out and the reversed return path, each (B, T // 2, H, W, 3).
 
-    The middle frame of an odd number of frames belongs to neither.
-
-    Args:
-        clips_BTHWC: (B, T, H, W, 3), frames k and T − 1 − k with the same camera.
+    Frames k and T − 1 − k of a clip have the same camera. The middle frame of an odd number of
+    frames belongs to neither.
 
     Raises:
         UserError: there are fewer than 2 frames.
@@ -121,7 +111,7 @@ def ways(clips_BTHWC: Array) -> tuple[Array, Array]:
 
 
 SIDE = 224
-"""Height and width of DINOv2's input, pixels."""
+"""Height and width of DINOv2's input, pixels: the multiple of the patch size nearest to it."""
 PICTURES = 16
 """Images in an encoder at once."""
 SMALL = 1e-12
@@ -137,7 +127,6 @@ class Similarity:
     Attributes:
         encoder: its name, as used in the metric's name.
         network: the encoder: settings of a DINOv2, or a network of LPIPS.
-        params: its parameters.
         sha256: hash of the weights file.
     """
 
@@ -152,10 +141,7 @@ class Similarity:
         return cosine(self.features(imagined), self.features(truth)).mean(1)
 
     def features(self, clips_BTHWC: Array) -> Array:
-        """Return the features of every frame, (B, T, F).
-
-        Args:
-            clips_BTHWC: (B, T, H, W, 3) colours in [0, 1].
+        """Return the features (B, T, F) of every frame of clips with colours in [0, 1].
 
         Raises:
             UserError: the images are too small for the encoder.
@@ -180,12 +166,7 @@ class Similarity:
 
 
 def cosine(a_XF: Array, b_XF: Array) -> Array:
-    """Return the cosine similarity of vectors, times 100, (...,); 0 where a vector is 0.
-
-    Args:
-        a_XF: (..., F).
-        b_XF: the same shape.
-    """
+    """Return the cosine similarity of vectors (..., F), times 100; 0 where a vector is 0."""
     lengths = jnp.linalg.norm(a_XF, axis=-1) * jnp.linalg.norm(b_XF, axis=-1)
     return 100 * (a_XF * b_XF).sum(-1) / (lengths + SMALL)
 
@@ -198,7 +179,8 @@ def _features(network: DINOv2Config | Net, params: Params, clips_BTHWC: Array) -
     def one(picture_HWC: Array) -> Array:
         picture = 2 * picture_HWC[None] - 1
         if isinstance(network, DINOv2Config):
-            images = dinov2.preprocess(picture, _side(network), network.patch)
+            side = max(1, round(SIDE / network.patch)) * network.patch
+            images = dinov2.preprocess(picture, side, network.patch)
             return dinov2.summary(network, params, images)[0]
         return lpips.features(network, params, picture)[-1].mean((1, 2))[0]
 
@@ -206,18 +188,11 @@ def _features(network: DINOv2Config | Net, params: Params, clips_BTHWC: Array) -
     return jax.lax.map(one, pictures, batch_size=PICTURES).reshape(clips, frames, -1)
 
 
-def _side(network: DINOv2Config) -> int:
-    """Return the multiple of the patch size nearest to 224."""
-    return max(1, round(SIDE / network.patch)) * network.patch
-
-
 def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
-    """Read an encoder.
+    """Read one of ``ENCODERS``.
 
-    Args:
-        encoder: one of ``ENCODERS``.
-        path: for DINOv2 a folder made by ``pewm-jax convert import dinov2``; for the others a file
-            as for LPIPS, by default the installed package's.
+    ``path`` is for DINOv2 a folder made by ``pewm-jax convert import dinov2``; for the others a
+    file as for LPIPS, by default the installed package's.
 
     Raises:
         UserError: there is no such encoder, or its weights are missing or damaged.
@@ -226,7 +201,7 @@ def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
         file = lpips_weights.find(_CNNS[encoder], path)
         net, params = lpips_weights.read(file, _CNNS[encoder])
         name = name_with_hash(net, params, lpips_weights.PUBLISHED[net])
-        return Similarity(name, net, jax.device_put(params), _hash(file))
+        return Similarity(name, net, jax.device_put(params), file_hash(file))
     if encoder != "dinov2":
         raise UserError(f"there is no encoder {encoder!r}; choose one of {', '.join(ENCODERS)}.")
     if path is None:
@@ -237,10 +212,8 @@ def read_encoder(encoder: str, path: str | Path | None = None) -> Similarity:
     network, params = dinov2.load(Path(path))
     params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
     return Similarity(
-        f"dinov2-{size_name(network)}", network, params, _hash(Path(path) / "weights.safetensors")
+        f"dinov2-{size_name(network)}",
+        network,
+        params,
+        file_hash(Path(path) / "weights.safetensors"),
     )
-
-
-def _hash(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

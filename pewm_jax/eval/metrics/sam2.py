@@ -28,11 +28,10 @@ images)."""
 
 
 def read(folder: str | Path, device: str = "cpu") -> Segmenter:
-    """Return SAM 2 as a segmenter: ``(video_THWC uint8, first_KHW bool) -> masks_KTHW bool``.
+    """Return SAM 2 as a ``Segmenter``.
 
-    Args:
-        folder: ``config.json`` and ``model.safetensors`` of a ``Sam2VideoModel``.
-        device: torch device, such as ``cuda``.
+    The folder has ``config.json`` and ``model.safetensors`` of a ``Sam2VideoModel``; ``device`` is
+    torch's, such as ``cuda``.
 
     Raises:
         UserError: torch or transformers are not installed, or the folder contains no such network.
@@ -108,11 +107,7 @@ def _track(network: Any, video_THWC: np.ndarray, first_KHW: np.ndarray) -> Itera
 
 
 def _libraries() -> tuple[Any, Any]:
-    """Import torch and transformers.
-
-    Raises:
-        UserError: they are not installed.
-    """
+    """Import torch and transformers, or raise a ``UserError`` if they are not installed."""
     try:
         torch = importlib.import_module("torch")
         transformers = importlib.import_module("transformers")

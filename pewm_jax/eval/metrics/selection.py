@@ -28,15 +28,10 @@ OFF, ON = "off", "on"
 
 @dataclasses.dataclass(frozen=True)
 class ReportMetrics:
-    """The optional metrics of a report.
+    """The optional metrics of a report, None if not measured; KVD is measured with ``i3d``.
 
-    Attributes:
-        lpips: LPIPS, or None.
-        i3d: FVD, or None; KVD is measured with it.
-        visits: name → metric of the mirror test.
-        structure: SCS, or None.
-        about: ``lpips``, ``fvd``, ``src`` and ``scs``: the description, or the reason why it is
-            skipped.
+    ``visits`` has the metrics of the mirror test; ``about`` for ``lpips``, ``fvd``, ``src`` and
+    ``scs`` the description, or the reason why it is skipped.
     """
 
     lpips: LPIPS | None
@@ -68,10 +63,8 @@ class ReportMetrics:
 def select_metrics(config: Config, *, accelerator: bool, ids: bool = False) -> ReportMetrics:
     """Return the optional metrics that an experiment's settings select.
 
-    Args:
-        config: ``model.clip`` and ``evaluate`` are used.
-        accelerator: whether the machine has one; otherwise I3D must be requested explicitly.
-        ids: whether the episodes have instance ids, which SCS needs.
+    ``accelerator`` says whether the machine has one; otherwise I3D must be requested explicitly.
+    ``ids`` says whether the episodes have instance ids, which SCS needs.
 
     Raises:
         UserError: explicitly requested weights are missing, damaged, or unsuitable for such images.
@@ -87,11 +80,7 @@ def select_metrics(config: Config, *, accelerator: bool, ids: bool = False) -> R
 
 
 def select_scs(setting: str, *, ids: bool) -> tuple[Consistency | None, str]:
-    """Return SCS with the segmenter of a setting, and a description or the reason for None.
-
-    Args:
-        setting: ``evaluate.scs``.
-        ids: whether the episodes have instance ids.
+    """Return SCS with the segmenter of ``evaluate.scs``, and a description or the reason for None.
 
     Raises:
         UserError: a segmenter is selected and the episodes have no ids, or it cannot be loaded.
@@ -118,12 +107,9 @@ def select_scs(setting: str, *, ids: bool) -> tuple[Consistency | None, str]:
 
 
 def select_fvd(setting: str, frames: int, *, accelerator: bool) -> tuple[VideoDistance | None, str]:
-    """Return the I3D that a setting selects, and a description or the reason for None.
+    """Return the I3D that ``evaluate.fvd`` selects, and a description or the reason for None.
 
-    Args:
-        setting: ``evaluate.fvd``.
-        frames: frames of a clip, including the observed one.
-        accelerator: whether the machine has one; otherwise I3D must be requested explicitly.
+    ``frames`` are those of a clip, including the observed one.
 
     Raises:
         UserError: explicitly requested weights are missing, damaged, or unsuitable for such clips.
@@ -161,13 +147,8 @@ def select_revisits(
 ) -> tuple[dict[str, Revisit], str]:
     """Return the metrics of the mirror test, and a description of SRC or why it is skipped.
 
-    PSNR is always included, SSIM if images are large enough, LPIPS if it is measured.
-
-    Args:
-        settings: ``evaluate.src``.
-        lpips: LPIPS, or None.
-        height: height of the images, pixels.
-        width: width of the images, pixels.
+    PSNR is always included, SSIM if images are large enough, LPIPS if it is measured. ``settings``
+    is ``evaluate.src``.
 
     Raises:
         UserError: explicitly requested weights are missing, damaged, or unsuitable for such images.
@@ -187,8 +168,7 @@ def select_revisits(
         if f"src[{encoder.encoder}]" in found:
             raise UserError(
                 f"evaluate.src names two encoders called src[{encoder.encoder}]: use one at a "
-                "time, "
-                "each in its own report (--out)."
+                "time, each in its own report (--out)."
             )
         found[f"src[{encoder.encoder}]"] = Revisit(f"src[{encoder.encoder}]", encoder)
     if not encoders:

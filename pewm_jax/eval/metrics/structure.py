@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.eval.seen import visible_in
+from pewm_jax.eval.metrics.images import visible_in
 from pewm_jax.geometry.cameras import unproject
 from pewm_jax.houses.kinds import SHELL, kind_of
 from pewm_jax.types import Array, Camera
@@ -65,12 +65,9 @@ class Structure:
 
 @dataclasses.dataclass(frozen=True)
 class Consistency:
-    """SCS with a segmenter.
+    """SCS with a segmenter and its name, such as ``flow`` or ``sam2``.
 
-    Attributes:
-        segment: propagates the first frame's masks through a video.
-        encoder: name of the segmenter, such as ``flow`` or ``sam2``.
-        sha256: hash of its weights; "" if it has none.
+    ``sha256`` is the hash of its weights; "" if it has none.
     """
 
     segment: Segmenter
@@ -83,12 +80,9 @@ class Consistency:
         return f"SCS[{self.encoder}]"
 
     def __call__(self, video_THWC: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
-        """Return ``overlaps`` of a clip, with masks by the segmenter.
+        """Return ``overlaps`` of a uint8 clip with masks by the segmenter.
 
-        Args:
-            video_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
-            masks_true_KTHW: (K, T, H, W) exact masks of the true clip.
-            visible_T: (T,) bool, as ``first_visible`` returns it.
+        Frame 0 of the clip is the observed one.
 
         Raises:
             UserError: the clip and the masks differ in shape.
@@ -124,15 +118,8 @@ def scs(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> flo
 def overlaps(masks_pred_KTHW: Array, masks_true_KTHW: Array, visible_T: Array) -> np.ndarray:
     """Return (K, T - 1) float64, 100 × IoU of each object in each frame but the first.
 
-    NaN where the frame is not counted, or the object is visible in neither clip.
-
-    Args:
-        masks_pred_KTHW: as for ``scs``.
-        masks_true_KTHW: as for ``scs``.
-        visible_T: as for ``scs``.
-
-    Raises:
-        UserError: the masks differ in shape, are not masks, or the numbers of frames differ.
+    NaN where the frame is not counted, or the object is visible in neither clip. Arguments and
+    errors are those of ``scs``.
     """
     pred, true = _masks(masks_pred_KTHW, masks_true_KTHW)
     end = _end(visible_T, true.shape[1])
@@ -151,21 +138,13 @@ def average(values: np.ndarray, axis: int | None = None) -> np.ndarray:
 
 
 def frames_in_view(visible_T: Array) -> int:
-    """Return the number of leading frames that show a point visible in frame 0.
-
-    Args:
-        visible_T: (T,) bool, whether each frame shows a point that frame 0 shows.
-    """
+    """Return the number of leading frames that show a point visible in frame 0."""
     gone = np.flatnonzero(~np.asarray(visible_T, bool))
     return int(gone[0]) if gone.size else len(np.asarray(visible_T))
 
 
 def _end(visible_T: Array, frames: int) -> int:
-    """Return ``frames_in_view``.
-
-    Raises:
-        UserError: it is not one bool per frame.
-    """
+    """Return ``frames_in_view``, or raise a ``UserError`` if it is not one bool per frame."""
     if np.shape(visible_T) != (frames,) or np.asarray(visible_T).dtype != np.bool_:
         raise UserError(
             f"visible_T of shape {np.shape(visible_T)} and type {np.asarray(visible_T).dtype} does "
@@ -178,13 +157,10 @@ def _end(visible_T: Array, frames: int) -> int:
 def first_visible(depth_THW: Array, camera: Camera) -> np.ndarray:
     """Return (T,) bool: whether each frame shows a surface point that frame 0 shows.
 
-    The points of frame 0's pixels are projected into the other frames. A point is visible if it
-    lies inside the image and agrees with the depth there (``seen.visible_in``), so occluded points
-    do not count: a frame that shows none shows only new places.
-
-    Args:
-        depth_THW: (T, H, W) true z-depth, metres; 0 = no measurement.
-        camera: (T,) true cameras, intrinsics (T, 4) in pixels.
+    The points of frame 0's pixels are projected into the other frames, with true z-depth (metres, 0
+    = no measurement) and cameras. A point is visible if it lies inside the image and agrees with
+    the depth there (``images.visible_in``), so occluded points do not count: a frame that shows
+    none shows only new places.
 
     Raises:
         UserError: there are no frames, or the first has no depth.
@@ -211,12 +187,10 @@ def _first_visible(depth_THW: Array, camera: Camera) -> Array:
 def object_ids(info: Mapping[str, Any]) -> list[int] | None:
     """Return the instance ids of an episode's static objects, or None if it has no names.
 
-    Walls, floors, ceilings, doorways and windows are not objects. Moving parts, such as robots and
-    doors, have ids after those of the named objects and are not included either: the score is about
-    apparent motion caused by the camera.
-
-    Args:
-        info: metadata of an episode; ``objects`` are the names of instances, by id.
+    ``objects`` of its metadata are the names of instances, by id. Walls, floors, ceilings, doorways
+    and windows are not objects. Moving parts, such as robots and doors, have ids after those of the
+    named objects and are not included either: the score is about apparent motion caused by the
+    camera.
     """
     names = info.get("objects")
     return None if names is None else [i for i, n in enumerate(names) if kind_of(n) not in SHELL]
@@ -259,9 +233,8 @@ def structural_consistency(
     Args:
         imagined_THWC: (T, H, W, 3) uint8; frame 0 is the observed one.
         truth_THWC: the true clip, the same shape.
-        masks_true_KTHW: (K, T, H, W) exact masks of the true clip, as from ``object_masks``.
-        visible_T: (T,) bool, whether each true frame still shows a point visible in frame 0, as
-            from ``first_visible``; frames from the first False on are not counted.
+        masks_true_KTHW: exact masks of the true clip, as from ``object_masks``.
+        visible_T: as for ``scs``, from ``first_visible``.
         segment: the segmenter; by default ``follow_by_flow``, the substitute.
 
     Raises:
@@ -281,15 +254,8 @@ def follow_by_flow(video_THWC: np.ndarray, first_KHW: np.ndarray) -> np.ndarray:
 
     Every pixel gets the label of the pixel in the previous frame from which it comes (dense inverse
     search, Kroeger et al. 2016). Pixels that fail the forward-backward check belong to no object.
-    It needs no weights and has no notion of objects: errors accumulate over frames.
-
-    Args:
-        video_THWC: (T, H, W, 3) uint8.
-        first_KHW: (K, H, W) bool, masks of the first frame; where they overlap, the last one
-            counts.
-
-    Returns:
-        (K, T, H, W) bool.
+    It needs no weights and has no notion of objects: errors accumulate over frames. Where the first
+    frame's masks overlap, the last one counts.
     """
     frames, height, width = video_THWC.shape[:3]
     labels = np.zeros((frames, height, width), np.int32)
@@ -318,11 +284,7 @@ def _flow(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def _masks(pred: Array, true: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Return two sets of masks as arrays.
-
-    Raises:
-        UserError: they differ in shape, or are not masks.
-    """
+    """Return two sets of masks as arrays, or raise a ``UserError`` if they cannot be compared."""
     pair = np.asarray(pred), np.asarray(true)
     shapes = [masks.shape for masks in pair]
     if shapes[0] != shapes[1] or pair[0].ndim != 4 or any(x.dtype != np.bool_ for x in pair):

@@ -9,8 +9,6 @@ is reported with it. The kernel distance is unbiased. Both are computed in float
 from __future__ import annotations
 
 import dataclasses
-import functools
-import hashlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +18,7 @@ import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.eval.metrics.images import colours, name_with_hash
+from pewm_jax.io.store import file_hash
 from pewm_jax.models.i3d import convert as i3d_weights
 from pewm_jax.models.i3d import model as i3d
 from pewm_jax.types import Array, Params
@@ -37,10 +36,6 @@ def frechet(a_NF: np.ndarray, b_MF: np.ndarray) -> float:
     Heusel et al. 2017, Eq. 6). With Σ = RᵀR, R of the QR decomposition of the centred vectors, the
     last trace is the sum of the singular values of Ra Rbᵀ: no matrix root is needed, and sets with
     fewer than F vectors need no special case.
-
-    Args:
-        a_NF: N ≥ 2 vectors.
-        b_MF: M ≥ 2 vectors.
 
     Raises:
         UserError: the sets are too small, of different widths, or not finite.
@@ -61,10 +56,6 @@ def kernel(a_NF: np.ndarray, b_NF: np.ndarray) -> float:
     unbiased even if partners are dependent, as an imagined clip and its ground truth are. It may be
     negative.
 
-    Args:
-        a_NF: N ≥ 2 vectors.
-        b_NF: M = N vectors.
-
     Raises:
         UserError: the sets are too small, of different sizes or widths, or not finite.
     """
@@ -74,14 +65,9 @@ def kernel(a_NF: np.ndarray, b_NF: np.ndarray) -> float:
             f"sets of {len(a)} and {len(b)} vectors have no kernel distance: give sets of equal "
             "size."
         )
-    inside = _cubic(a, a) + _cubic(b, b)
-    across = _cubic(a, b)
-    pairs = inside - across - across.T
+    own_a, own_b, across = ((x @ y.T / a.shape[1] + 1) ** 3 for x, y in ((a, a), (b, b), (a, b)))
+    pairs = own_a + own_b - across - across.T
     return float((pairs.sum() - np.trace(pairs)) / (len(a) * (len(a) - 1)))
-
-
-def _cubic(a_NF: np.ndarray, b_MF: np.ndarray) -> np.ndarray:
-    return (a_NF @ b_MF.T / a_NF.shape[1] + 1) ** 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,26 +79,10 @@ class Spread:
 
 
 def distance_floor(
-    distance: Distance,
-    truth_NF: np.ndarray,
-    n: int | None = None,
-    *,
-    splits: int = SPLITS,
-    seed: int = 0,
+    distance: Distance, truth_NF: np.ndarray, n: int | None = None, **draws: int
 ) -> Spread:
-    """Return a distance between two disjoint sets of n true clips, averaged over random draws.
-
-    Args:
-        distance: ``frechet`` or ``kernel``.
-        truth_NF: features of true clips.
-        n: vectors in each set; by default half of them.
-        splits: number of random draws.
-        seed: seed of the draws.
-
-    Raises:
-        UserError: there are fewer than 2 n vectors, or n is below 2.
-    """
-    return distance_of_halves(distance, truth_NF, truth_NF, n, splits=splits, seed=seed)
+    """Return ``distance_of_halves`` of true clips: a distance between two disjoint sets of them."""
+    return distance_of_halves(distance, truth_NF, truth_NF, n, **draws)
 
 
 def distance_of_halves(
@@ -126,19 +96,11 @@ def distance_of_halves(
 ) -> Spread:
     """Return a distance of n imagined clips from the ground truth of n others.
 
-    With equal arguments the same clips are drawn as in ``distance_floor``, so that the two can be
-    compared.
-
-    Args:
-        distance: ``frechet`` or ``kernel``.
-        imagined_NF: features of imagined clips.
-        truth_NF: features of their ground truth, in the same order.
-        n: vectors in each set; by default half of them.
-        splits: number of random draws.
-        seed: seed of the draws.
+    It is averaged over ``splits`` random draws; n is by default half of the clips. With equal
+    arguments the same clips are drawn as in ``distance_floor``, so that the two can be compared.
 
     Raises:
-        UserError: see ``distance_floor``.
+        UserError: there are fewer than 2 n vectors, n is below 2, or the two are not pairs.
     """
     count = len(truth_NF)
     n = count // 2 if n is None else n
@@ -147,8 +109,7 @@ def distance_of_halves(
     if n < 2 or 2 * n > count:
         raise UserError(
             f"two sets of {n} clips cannot be drawn from {count}: each needs at least 2 clips, and "
-            "none "
-            "in common."
+            "none in common."
         )
     rng, found = np.random.default_rng(seed), []
     for _ in range(splits):
@@ -164,11 +125,7 @@ def _root(x_NF: np.ndarray) -> np.ndarray:
 
 
 def _sets(a_NF: np.ndarray, b_MF: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return both sets in float64.
-
-    Raises:
-        UserError: the sets cannot be compared.
-    """
+    """Return both sets in float64, or raise a ``UserError`` if they cannot be compared."""
     a, b = (np.asarray(x, np.float64) for x in (a_NF, b_MF))
     if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
         raise UserError(
@@ -197,7 +154,6 @@ class SetScore:
 
     Attributes:
         value: between all imagined clips and all true ones.
-        clips: number of clips of each.
         half: between half of the imagined clips and the ground truth of the others, over random
             halves; None with fewer than 4 clips.
         floor: between the ground truth of the two halves, over the same halves.
@@ -219,11 +175,8 @@ class SetScore:
 class VideoDistance:
     """FVD or KVD with the weights of I3D.
 
-    Attributes:
-        kind: which of them.
-        params: parameters of I3D.
-        sha256: hash of the weights file.
-        encoder: the network's name, with a hash for weights other than the package's.
+    ``sha256`` is the hash of the weights file; ``encoder`` the network's name, with a hash for
+    weights other than the package's.
     """
 
     kind: Kind
@@ -234,9 +187,7 @@ class VideoDistance:
     def __call__(self, imagined_BTHWC: Array, truth_BTHWC: Array) -> np.ndarray:
         """Return one value for the whole set, () float64; lower is better, 0 for equal sets.
 
-        Args:
-            imagined_BTHWC: (B, T, H, W, 3) floats in [−1, 1], or uint8; B ≥ 2, T ≥ 9.
-            truth_BTHWC: the same shape.
+        Both are (B, T, H, W, 3) floats in [−1, 1], or uint8; B ≥ 2, T ≥ 9.
 
         Raises:
             UserError: the clips differ in shape, or are too few or too short.
@@ -246,6 +197,10 @@ class VideoDistance:
             self.distance(self.features(imagined_BTHWC), self.features(truth_BTHWC)), np.float64
         )
 
+    def kinds(self) -> dict[Kind, VideoDistance]:
+        """Return FVD and KVD with the same weights."""
+        return {kind: dataclasses.replace(self, kind=kind) for kind in DISTANCES}
+
     @property
     def distance(self) -> Distance:
         """Return the distance between sets of features."""
@@ -254,9 +209,6 @@ class VideoDistance:
     def features(self, video_BTHWC: Array) -> np.ndarray:
         """Return the features of clips, (B, 400); those of several batches can be joined.
 
-        Args:
-            video_BTHWC: (B, T, H, W, 3) floats in [−1, 1], or uint8; T ≥ 9.
-
         Raises:
             UserError: the clips are too short, or not colours.
         """
@@ -264,12 +216,9 @@ class VideoDistance:
         return np.asarray(_features(self.params, colours(video_BTHWC, video_BTHWC)[0]))
 
     def score(self, imagined_NF: np.ndarray, truth_NF: np.ndarray, seed: int = 0) -> SetScore:
-        """Return the distance between sets of features, and of the ground truth from itself.
+        """Return the distance between the features of all imagined clips and of their ground truth.
 
-        Args:
-            imagined_NF: ``features`` of all imagined clips.
-            truth_NF: those of their ground truth, in the same order.
-            seed: seed of the random halves.
+        ``seed`` is that of the random halves.
 
         Raises:
             UserError: the sets are too small, of different shapes, or not finite.
@@ -307,22 +256,15 @@ class VideoDistance:
 def _features(params: Params, video_BTHWC: Array) -> Array:
     """Return the logits of clips with colours in [0, 1], a bounded number of them at once."""
     at_once = max(1, FRAMES // video_BTHWC.shape[1])
-    one = functools.partial(_clip_features, params)
-    return jax.lax.map(one, 2 * video_BTHWC - 1, batch_size=at_once)
-
-
-def _clip_features(params: Params, video_THWC: Array) -> Array:
-    return i3d.apply(params, video_THWC[None])[0]
+    return jax.lax.map(
+        lambda video_THWC: i3d.apply(params, video_THWC[None])[0],
+        2 * video_BTHWC - 1,
+        batch_size=at_once,
+    )
 
 
 def read_i3d(path: Path, kind: Kind) -> VideoDistance:
-    """Read FVD or KVD from a file with the weights of I3D.
-
-    Raises:
-        UserError: see ``models.i3d.convert.read``.
-    """
+    """Read FVD or KVD from the weights of I3D; see ``models.i3d.convert.read``."""
     params = i3d_weights.read(path)
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256").hexdigest()
     encoder = name_with_hash(NAME, params, i3d_weights.PUBLISHED)
-    return VideoDistance(kind, jax.device_put(params), digest, encoder)
+    return VideoDistance(kind, jax.device_put(params), file_hash(path), encoder)
