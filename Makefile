@@ -59,7 +59,7 @@ table2: .venv/installed
 	@$(PY) -m pewm_jax table2 $(ARGS)
 
 test: .venv/installed-dev
-	@$(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
+	@PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
 	  -m "not slow" --hypothesis-profile quick $(ARGS)
 
 # The compilers of TPUs and NVIDIA GPUs, without which two tests are skipped; 2 GB.
@@ -68,7 +68,7 @@ test: .venv/installed-dev
 	@touch $@
 
 test-all: .venv/installed-plan
-	@JAX_PLATFORMS=cpu $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	@JAX_PLATFORMS=cpu PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-newest:
 	@PYTHON="$(PYTHON)" .ci/newest $(NEWEST) $(ARGS)

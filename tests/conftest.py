@@ -75,6 +75,11 @@ FIRST = (
     "train/test_kills.py",
     "cli/test_train.py",
     "eval/test_evaluate.py",
+    "worlds/test_calls.py",
+    "worlds/pewm/test_world.py",
+    "planning/test_worlds.py",
+    "worlds/persist/test_world.py",
+    "worlds/test_rollouts.py",
 )
 """Files that take longest: begun first, so that no worker is left alone with one at the end."""
 

@@ -73,8 +73,36 @@ def randomise(params, seed=0, scale=0.2):
     """Replace every leaf, norms and zero-initialised gates included, by random numbers."""
     leaves, tree = jax.tree.flatten(params)
     rng = np.random.default_rng(seed)
-    drawn = [jnp.asarray(rng.normal(0, scale, x.shape), jnp.float32) + 0.5 * x for x in leaves]
-    return jax.tree.unflatten(tree, drawn)
+    half = np.float32(0.5)  # in NumPy: to add arrays of many shapes in JAX compiles for each shape
+    drawn = [
+        np.asarray(rng.normal(0, scale, x.shape), np.float32) + half * np.asarray(x, np.float32)
+        for x in leaves
+    ]
+    return jax.tree.unflatten(tree, [jnp.asarray(x) for x in drawn])
+
+
+def randomised(init, *args, seed=0, scale=0.2):
+    """Return ``randomise`` of what ``init`` returns, without compiling it.
+
+    Norms start at 1, matrices at random numbers by how many they add up, and all else at 0.
+    """
+    rng = np.random.default_rng(seed + 1)
+
+    def start(path, leaf):
+        if "scale" in jax.tree_util.keystr(path[-1:]):
+            return np.ones(leaf.shape, np.float32)
+        wide = leaf.ndim > 1
+        return rng.normal(0, np.prod(leaf.shape[:-1]) ** -0.5 if wide else 0, leaf.shape)
+
+    shapes = jax.eval_shape(functools.partial(init, *args))
+    return randomise(jax.tree_util.tree_map_with_path(start, shapes), seed, scale)
+
+
+def random_world(config, *, memory=True, seed=0, scale=0.2):
+    """Return random weights of a model or an experiment."""
+    model = config.model if isinstance(config, Config) else config
+    init = functools.partial(world_model.init, memory=memory)
+    return randomised(init, model, jax.random.key(0), seed=seed, scale=scale)
 
 
 def random_camera(rng, frames, height=16, width=24, upright=False) -> Camera:

@@ -13,7 +13,7 @@ from pewm_jax.config import ClipConfig, Codec, ConfigError, UserError, from_dict
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.worlds import objective
 from pewm_jax.worlds.codec import CodecTask
-from tests.helpers import init_world, random_frames, randomise, tiny_model
+from tests.helpers import init_world, random_frames, randomised, tiny_model
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
 init = jax.jit(LearnedCodecConfig.init, static_argnums=0)
@@ -23,7 +23,7 @@ decode = jax.jit(LearnedCodecConfig.decode, static_argnums=0)
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(init(TINY, jax.random.key(0)))
+    return randomised(TINY.init, jax.random.key(0))
 
 
 def videos(*shape, seed=0):

@@ -16,6 +16,7 @@ from pewm_jax.diffusion.flow import FlowConfig
 from pewm_jax.memory.images import ImagesConfig
 from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
+from tests.properties import cases
 
 TINY = presets.load("tiny")
 VERSION_1 = Path(__file__).parent / "version_1"
@@ -241,7 +242,7 @@ def test_a_flag_is_negated_in_every_spelling(setting, new):
     head, _, last = setting.rpartition(".")
     spellings = [f"no-{setting}", f"no_{setting}", f"{head}.no-{last}", f"{head}.no_{last}"]
     spellings += [name.replace("_", "-") for name in spellings]
-    for name in spellings:
+    for name in cases(spellings, 3):
         (full,) = cli.full_names([f"--{name}"], VAE)
         assert full.replace("no-", "no_").replace("-terminal-snr", "_terminal_snr") == f"--{new}"
         assert parse(f"--{name}", default=VAE) == parse(f"--{new}", default=VAE)

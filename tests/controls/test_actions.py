@@ -16,7 +16,7 @@ from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models import interface as backbones
 from pewm_jax.readers.render import RenderConfig
 from pewm_jax.types import Control
-from tests.helpers import TINY, random_camera, random_frames, randomise, tiny_model
+from tests.helpers import TINY, random_camera, random_frames, randomised, tiny_model
 
 E, BATCH = TINY.backbone.time_dim, 2
 WIDE = {name: (value,) * 25 for name, value in (("units", 1.0), ("low", -2.0), ("high", 2.0))}
@@ -33,7 +33,7 @@ def model_of(temporal=4, **settings):
 def steered(model, actions, params=None, state=None, observed=1):
     """The control's conditioning of a batch of clips."""
     rng = np.random.default_rng(0)
-    params = randomise(model.control.init(model, jax.random.key(0))) if params is None else params
+    params = randomised(model.control.init, model, jax.random.key(0)) if params is None else params
     frames, camera = random_frames(rng, observed), random_camera(rng, model.clip.frames)
     both = jax.tree.map(lambda x: np.repeat(np.asarray(x)[None], BATCH, 0), (frames, camera))
     return model.control.condition(model, params, both[0], Control(both[1], actions, state))
@@ -75,7 +75,7 @@ def test_an_embedding_per_latent_frame_that_knows_no_later_action(temporal, sett
 def test_only_frames_to_be_imagined_have_actions_and_the_state_is_in_all():
     model = model_of(1, state=3)
     state = np.full((BATCH, 3), 0.5, np.float32)
-    params = randomise(model.control.init(model, jax.random.key(0)))
+    params = randomised(model.control.init, model, jax.random.key(0))
     made = steered(model, actions_of(model), params, state, observed=3).modulation_BtE
     np.testing.assert_array_equal(made[:, 0], made[:, 2])
     assert np.abs(made[:, 3] - made[:, 2]).max() > 1e-3
@@ -104,14 +104,10 @@ def test_before_training_any_action_leaves_the_output_bit_for_bit():
     time = np.array([100.0, 900.0], np.float32)
 
     @functools.partial(jax.jit, static_argnums=0)
-    def init(backbone, key):
-        return backbone.init(key, 8, 4)
-
-    @functools.partial(jax.jit, static_argnums=0)
     def run(backbone, params, x, time, given):
         return backbone.apply(params, x, time, given)
 
-    params = randomise(init(model.backbone, jax.random.key(0)))
+    params = randomised(model.backbone.init, jax.random.key(0), 8, 4)
     without = run(model.backbone, params, x, time, backbones.Conditioning())
     np.testing.assert_array_equal(run(model.backbone, params, x, time, made), without)
 

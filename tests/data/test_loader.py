@@ -40,6 +40,7 @@ def test_a_jump_gives_what_iteration_gives(folder):
     batches = list(itertools.islice(loader.clips(config(folder), seed=1, batch=4), 6))
     for k in (0, 2, 5):
         assert same(next(loader.clips(config(folder), seed=1, batch=4, start_step=k)), batches[k])
+        assert same(loader.dataset(config(folder), "train", seed=1, batch=4)[k], batches[k])
     assert not same(batches[0], batches[1])
     assert not same(next(loader.clips(config(folder), seed=2, batch=4)), batches[0])
 

@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,9 +9,10 @@ import pytest
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import ConfigError, TrainConfig
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.types import Clip, Control
+from pewm_jax.types import Clip, Control, MemoryReadout
 from pewm_jax.worlds import objective, world_model
-from tests.helpers import TINY, init_world, random_frames, randomise, tiny_model
+from tests.helpers import TINY, random_frames, random_world, tiny_model
+from tests.worlds.test_world_model import setup
 
 
 def drawn(config, denoise, noise, key=None, **more):
@@ -118,6 +120,7 @@ def make_clip(seed=0, batch=2, context=3):
 sample = jax.jit(world_model.sample, static_argnums=0)
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def conditioning_of(model, params, clip):
     """What the clips' first frames and cameras say."""
     frames = jax.tree.map(jnp.asarray, as_signal(clip.frames))
@@ -130,7 +133,7 @@ def conditioning_of(model, params, clip):
 def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
     model, train = tiny_model(noise=DDPMConfig(target=kind)), TrainConfig()
     clip, key = make_clip(), jax.random.key(0)
-    params = randomise(init_world(model, key))
+    params = random_world(model)
     other = dataclasses.replace(clip, context=jax.tree.map(np.zeros_like, clip.context))
     loss = jax.jit(objective.loss, static_argnums=(0, 1), static_argnames="memory")
     stage1 = [float(loss(model, train, params, c, key, memory=False)[0]) for c in (clip, other)]
@@ -142,7 +145,7 @@ def test_the_loss_is_finite_and_stage_1_ignores_the_memory(kind):
 
 def test_pixels_without_depth_do_not_train_depth():
     clip, key = make_clip(), jax.random.key(0)
-    params = randomise(init_world(TINY, key, memory=False))
+    params = random_world(TINY, memory=False)
     loss = jax.jit(objective.without_memory, static_argnums=(0, 1))
     blank = dataclasses.replace(
         clip, frames=dataclasses.replace(clip.frames, depth_THW=clip.frames.depth_THW * 0)
@@ -165,16 +168,24 @@ def test_invalid_context_frames_are_not_remembered():
     assert tokens.valid_M.any()
 
 
-def test_guidance_interpolates_between_with_and_without_map():
-    clip, key = make_clip(), jax.random.key(0)
-    params = randomise(init_world(TINY, key))
-    conditioning = conditioning_of(TINY, params, clip)
-    readout = objective.clip_readout(TINY, params, clip)
-    noise = jax.random.normal(key, (2, 3, 4, 6, 256))
+@pytest.mark.slow(but="a function")
+@pytest.mark.parametrize("network", ["a function", "the transformer"])
+def test_guidance_interpolates_between_with_and_without_map(network, monkeypatch):
+    model, conditioning, tokens, noise, _ = setup()
+    params, readout = random_world(model), MemoryReadout(tokens)
+
+    def function(model, params, x, given, times, readout=None):
+        return jnp.sin(x) if readout is None else jnp.cos(x) * readout.tokens.features_MF.mean()
+
+    if network == "a function":
+        monkeypatch.setattr(world_model, "apply", function)
 
     def run(guidance, readout, **more):
         settings = dataclasses.replace(TINY.noise, guidance=guidance, sample_steps=1, **more)
-        return sample(tiny_model(noise=settings), params, conditioning, readout, noise)
+        guided = dataclasses.replace(model, noise=settings)
+        # Traced anew: what was traced before holds the other network.
+        traced = jax.jit(lambda *inputs: world_model.sample(guided, *inputs))
+        return traced(params, conditioning, readout, noise)
 
     with_map, without = run(1.0, readout), run(1.0, None)
     np.testing.assert_allclose(run(0.0, readout), without, atol=1e-5)
@@ -261,7 +272,7 @@ def test_a_fixed_stride_differs_only_where_the_steps_do_not_divide():
 def test_the_world_model_samples_by_dpm_with_its_own_noise():
     model = tiny_model(noise=DDPMConfig(sampler="dpm", sample_steps=2))
     clip, key = make_clip(batch=1), jax.random.key(0)
-    params = randomise(init_world(model, key, memory=False))
+    params = random_world(model, memory=False)
     conditioning = conditioning_of(model, params, clip)
     noise = jax.random.normal(key, (1, 3, 4, 6, 256))
     draw = [sample(model, params, conditioning, None, noise, jax.random.key(k)) for k in (0, 0, 1)]

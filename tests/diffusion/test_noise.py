@@ -18,7 +18,7 @@ from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import FlowConfig, FrameFlowConfig
 from pewm_jax.worlds import objective
 from tests.diffusion.test_ddpm import make_clip
-from tests.helpers import TINY, init_world, randomise, tiny_model
+from tests.helpers import TINY, random_world, tiny_model
 from tests.properties import examples
 
 KINDS = {
@@ -269,7 +269,7 @@ def test_flow_draws_a_time_for_every_frame_if_asked():
 @pytest.mark.slow
 def test_training_with_a_time_for_every_frame(monkeypatch):
     clip, key, train = make_clip(), jax.random.key(0), TrainConfig()
-    params = randomise(init_world(TINY, memory=False))
+    params = random_world(TINY, memory=False)
 
     def loss(config):
         model = tiny_model(noise=config)
@@ -290,7 +290,7 @@ def test_training_with_a_time_for_every_frame(monkeypatch):
 @pytest.mark.parametrize("config", [EDMConfig(), FlowConfig(per_frame=True)], ids=["edm", "flow"])
 def test_both_stages_train_with_every_noise(config):
     model, clip = tiny_model(noise=config), make_clip()
-    params = randomise(init_world(TINY))
+    params = random_world(TINY)
 
     @jax.jit
     def slopes(params):

@@ -32,7 +32,7 @@ from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.codec import CodecTask
 from pewm_jax.worlds.pewm import world as pewm
 from tests import properties
-from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
+from tests.helpers import TINY, init_world, random_camera, random_frames, random_world, tiny_model
 
 CODEC = LearnedCodecConfig(
     latent_channels=4, fine=8, coarse=8, fine_blocks=1, coarse_blocks=1, gate=8
@@ -93,7 +93,7 @@ def model_of(kind):
 
 @functools.cache
 def weights(kind):
-    params = randomise(init_world(model_of(kind)))
+    params = random_world(model_of(kind))
     params["codec"]["latent_scale_C"] = jnp.linspace(0.5, 2, 4)
     return params
 

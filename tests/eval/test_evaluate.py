@@ -23,7 +23,7 @@ from pewm_jax import config as configs
 from pewm_jax.cli import main, parser
 from pewm_jax.cli import main as program
 from pewm_jax.config import StageConfig, TrainConfig, UserError
-from pewm_jax.eval import compare, preview, runner
+from pewm_jax.eval import compare, preview, reproject, runner
 from pewm_jax.eval import evaluate as report
 from pewm_jax.eval import loaded_run as runs
 from pewm_jax.eval.runner import Methods, ModelRunner
@@ -66,6 +66,7 @@ def compile_once():
     with pytest.MonkeyPatch.context() as patch:
         original = runner._compile
         patch.setattr(runner, "_compile", cached)
+        patch.setattr(reproject, "CANDIDATES", reproject.CANDIDATES[:2])
         yield
 
 

@@ -127,7 +127,8 @@ def test_any_memory_of_places_is_edited_by_the_same_functions_and_others_say_so(
     points = rng.uniform(-1.5, 1.5, (100, 3)).astype(np.float32)
     values = rng.normal(size=(100, model.memory.encoder.channels)).astype(np.float32)
     empty = voxel_map.empty(config, np.zeros(3), values.shape[1])
-    world = voxel_map.insert(config, empty, points, values, np.ones(100, bool))
+    insert = jax.jit(voxel_map.insert, static_argnums=0)
+    world = insert(config, empty, points, values, np.ones(100, bool))
     shift = turned(0, (0.5, 0, 0))
     jax.tree.map(
         np.testing.assert_array_equal,

@@ -173,14 +173,10 @@ def test_a_memory_is_told_what_is_imagined_where_it_asks():
         easy = {"imagined_far": 99.0, "imagined_edge": 0.0}
         config = dataclasses.replace(config, cells=(24, 24, 24), capacity=2048, **easy)  # noqa: PLW2901
         model = tiny_model(memory=config)
+        memory = model.memory.empty(model, jnp.zeros(3))
         made = [
-            memories.insert(
-                model,
-                {},
-                model.memory.empty(model, jnp.zeros(3)),
-                frames,
-                encoded(frames),
-                observed=truth,
+            jax.jit(functools.partial(memories.insert, model, observed=truth))(
+                {}, memory, frames, encoded(frames)
             )
             for truth in (True, False)
         ]

@@ -252,6 +252,7 @@ def reference(q, k, v):
 IN_SPLASH = [(128, 128, 128), (13, 11, 8), (130, 257, 64), (300, 384, 80), (257, 16, 64)]
 
 
+@pytest.mark.slow(but=("13-11-8-float32", "130-257-64-bfloat16", "300-384-80-float32"))
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
 @pytest.mark.parametrize(("queries", "keys", "channels"), IN_SPLASH)
 def test_splash_attention_equals_the_reference_forward_and_backward(queries, keys, channels, dtype):

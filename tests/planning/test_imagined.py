@@ -22,7 +22,7 @@ from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.planning.imagined_env import WorldModelEnv
 from pewm_jax.planning.observations import planar_of
 from pewm_jax.worlds.codec import CodecTask
-from tests.helpers import init_world, randomise
+from tests.helpers import random_world
 from tests.planning.page import blocks
 
 TINY = presets.load("tiny")
@@ -53,7 +53,7 @@ def close(a, b, atol=1e-4):
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(init_world(CONFIG), scale=0.1)
+    return random_world(CONFIG, scale=0.1)
 
 
 @functools.cache

@@ -21,7 +21,15 @@ from pewm_jax.readers.geometry import sightings, sinusoid_3d
 from pewm_jax.readers.memory_block import MemoryBlock, masked_attention
 from pewm_jax.types import Camera, Clip, Control, Frames, MapTokens, MemoryReadout
 from pewm_jax.worlds import objective, rollouts, world_model
-from tests.helpers import TINY, random_camera, random_frames, randomise, rigid, with_reader
+from tests.helpers import (
+    TINY,
+    random_camera,
+    random_frames,
+    random_world,
+    randomise,
+    rigid,
+    with_reader,
+)
 from tests.properties import examples
 
 BOTH = pytest.mark.parametrize("positions", ["projective", "sinusoid"])
@@ -62,8 +70,7 @@ TIMES = jnp.array([5, 700])
 
 @functools.cache
 def weights(positions):
-    init = jax.jit(world_model.init, static_argnums=0)
-    return randomise(init(model_of(positions=positions), jax.random.key(0)))
+    return random_world(model_of(positions=positions))
 
 
 def predict(positions, tokens, conditioning=None, **changes):

@@ -19,7 +19,15 @@ from pewm_jax.types import Clip, Control, Frames, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.pewm import world as pewm
 from tests import properties
-from tests.helpers import TINY, init_world, random_camera, random_frames, randomise, tiny_model
+from tests.helpers import (
+    TINY,
+    init_world,
+    random_camera,
+    random_frames,
+    random_world,
+    randomise,
+    tiny_model,
+)
 
 READERS = {
     "attend": AttentionConfig(heads=4, head_dim=8),
@@ -88,7 +96,7 @@ def test_a_fresh_reader_changes_nothing_bit_for_bit(kind):
 @ALL
 def test_an_empty_memory_changes_nothing_bit_for_bit_whatever_was_learned(kind):
     model, (_, readout, _) = model_of(kind), inputs()
-    params = randomise(init_world(model))
+    params = random_world(model)
     backbone = {"backbone": params["backbone"]}
     base = predict(TINY, backbone, None)
     np.testing.assert_array_equal(predict(model, params, hidden(readout)), base)
@@ -99,7 +107,7 @@ def test_an_empty_memory_changes_nothing_bit_for_bit_whatever_was_learned(kind):
 @RENDERS
 def test_what_features_say_where_nothing_is_seen_is_not_read(kind):
     model, (_, readout, _) = model_of(kind), inputs()
-    params = randomise(init_world(model))
+    params = random_world(model)
     seen = readout.view.seen_THW
     junk = View(
         jnp.where(seen[..., None], readout.view.features_THWF, jnp.nan),
@@ -112,7 +120,7 @@ def test_what_features_say_where_nothing_is_seen_is_not_read(kind):
 
 def test_each_token_gets_the_pixels_that_it_stands_for():
     model, (conditioning, readout, _) = model_of("render"), inputs()
-    params = randomise(init_world(model)["memory"])
+    params = random_world(model)["memory"]
     camera, rays = conditioning.camera, conditioning.rays_BthwC
     added = functools.partial(
         model.memory.reader.prepare, model, params, camera=camera, rays_BthwC=rays
@@ -147,7 +155,7 @@ def test_many_channels_are_reduced_and_a_token_in_time_may_hold_two_latent_frame
 
 def test_a_block_takes_a_time_for_each_frame():
     model, (conditioning, readout, _) = model_of("render"), inputs()
-    params = randomise(init_world(model)["memory"])
+    params = random_world(model)["memory"]
     read = model.memory.reader.prepare(
         model, params, readout, conditioning.camera, conditioning.rays_BthwC
     )
@@ -203,6 +211,6 @@ def test_without_a_memory_there_is_nothing_to_see_but_a_reader_to_train(kind):
     model = model_of(kind, NoMemoryConfig)
     readout = look(model, {}, batch_of(model))
     assert not np.asarray(readout.view.seen_THW).any()
-    params = randomise(init_world(model))
+    params = random_world(model)
     base = predict(model, {"backbone": params["backbone"]}, None)
     assert np.abs(predict(model, params, readout) - base).max() > 1e-3

@@ -23,7 +23,7 @@ from pewm_jax.studies import practice as study
 from pewm_jax.studies.practice import COLUMNS
 from pewm_jax.studies.practice_piece import LEARNED, ROWS, PracticeConfig
 from pewm_jax.types import Camera, Frames
-from tests.helpers import init_world, randomise
+from tests.helpers import random_world
 from tests.planning.page import blocks
 from tests.train.test_nomad import experiment
 
@@ -46,7 +46,7 @@ def forward(rgb_SHWC, goal_HWC, key):
 @pytest.fixture(scope="module")
 def world():
     config = presets.load("tiny")
-    return config, randomise(init_world(config, jax.random.key(0)), scale=0.3)
+    return config, random_world(config, scale=0.3)
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from pewm_jax.planning import costs, scores
 from pewm_jax.planning.settings import PlanConfig
 from pewm_jax.studies import deciders, goals, table2
 from pewm_jax.worlds import world_model
-from tests.helpers import init_world, randomise
+from tests.helpers import init_world, random_world
 
 MOTION = ActionConfig()
 PLAN = PlanConfig(horizon=4, candidates=6, elites=2, rounds=2)
@@ -120,9 +120,7 @@ def test_a_step_or_a_turn_short_is_there_and_two_are_not():
 @pytest.mark.slow
 def test_only_the_mind_with_a_memory_sees_the_past():
     config = presets.load("tiny")
-    predictors = deciders.Predictors(
-        config, randomise(init_world(config, jax.random.key(0)), scale=0.3)
-    )
+    predictors = deciders.Predictors(config, random_world(config, scale=0.3))
     goal = task(0, actions=4)
     blind = dataclasses.replace(
         goal,
@@ -223,7 +221,7 @@ class _Spied(deciders.Predictors):
 @pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
 def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
     config = presets.load("tiny")  # 4 actions at once
-    predictors = _Spied(config, randomise(init_world(config, jax.random.key(0)), scale=0.3))
+    predictors = _Spied(config, random_world(config, scale=0.3))
     object.__setattr__(predictors, "seen", [])
     goal = task(1, actions=8)
     one = dataclasses.replace(PLAN, horizon=8, rounds=1)

@@ -19,7 +19,7 @@ from pewm_jax.train import flops
 from pewm_jax.types import EncodedView, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds import objective as chained
-from tests.helpers import TINY, init_world, randomise, tiny_config
+from tests.helpers import TINY, random_world, tiny_config
 from tests.train import fakes
 from tests.train.test_prepared import a_batch
 
@@ -68,7 +68,7 @@ def ready_batch(config):
 
 @pytest.fixture(scope="module")
 def world():
-    return randomise(init_world(CONFIG)), ready_batch(CONFIG)
+    return random_world(CONFIG), ready_batch(CONFIG)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -24,7 +24,7 @@ from pewm_jax.types import Frames
 from pewm_jax.worlds import codec as codec_gate
 from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 from pewm_jax.worlds.rollouts import load_finished
-from tests.helpers import TINY, init_world, random_camera, randomise, tiny_config
+from tests.helpers import TINY, random_camera, random_world, tiny_config
 
 CODEC = LearnedCodecConfig(
     latent_channels=4, fine=8, coarse=8, fine_blocks=1, coarse_blocks=1, gate=8
@@ -145,7 +145,7 @@ LAST = worlds.stages(tiny_config())[3]
 )
 def test_the_gate_learns_alone_on_what_the_model_imagines(reader):
     config = imagining(reader)
-    params = randomise(init_world(config.model))
+    params = random_world(config.model)
     clip = batch(config, 2)
     ready = jax.device_get(jax.jit(lambda p, c: LAST.prepare(config.model, p, c))(params, clip))
     assert ready.extras["latents_thwC"].shape[:2] == (2, 9)

@@ -67,6 +67,7 @@ def test_a_run_leaves_all_that_inference_needs(undisturbed):
     )
 
 
+@pytest.mark.slow(but=("3-2", "4-2", "6-1"))
 @pytest.mark.parametrize("stage", [1, 2])
 @pytest.mark.parametrize("step", [3, 4, 6])
 def test_a_stopped_run_goes_on_bit_identically(undisturbed, tmp_path, stage, step):

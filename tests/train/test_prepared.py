@@ -10,7 +10,7 @@ import pytest
 from pewm_jax import worlds
 from pewm_jax.train import feed
 from pewm_jax.types import Clip
-from tests.helpers import init_world, random_frames, randomise, tiny_config
+from tests.helpers import random_frames, random_world, tiny_config
 
 
 def a_batch(config, rows):
@@ -30,7 +30,7 @@ def a_batch(config, rows):
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_prepared_batch_has_the_same_loss_without_its_context(number):
     config = tiny_config()
-    params = randomise(init_world(config.model))
+    params = random_world(config.model)
     clip = a_batch(config, 3)
     stage = worlds.stages(config)[number]
     ready = jax.device_get(jax.jit(lambda p, c: stage.prepare(config.model, p, c))(params, clip))

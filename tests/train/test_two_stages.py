@@ -16,7 +16,7 @@ from pewm_jax.train import sharding, step
 from pewm_jax.types import Clip
 from pewm_jax.worlds import stages, world_model
 from pewm_jax.worlds.pewm.world import STAGES
-from tests.helpers import init_world, random_frames, randomise, with_reader
+from tests.helpers import random_frames, random_world, with_reader
 
 TWO = STAGES[1]
 EVERYTHING = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
@@ -66,7 +66,7 @@ def test_a_step_of_stage_2_costs_at_most_three_quarters_of_training_everything(s
 
 
 def test_frozen_leaves_stay_bit_identical_and_only_trained_ones_have_moments(stage_2):
-    start = randomise(init_world(CONFIG, jax.random.key(1), memory=False))
+    start = random_world(CONFIG, memory=False)
     now = step.initial_state(CONFIG, TWO, one_device(), start)
     before = jax.tree.map(np.array, now)
     clip = jax.device_put(CLIP, sharding.of_batch(one_device()))
@@ -120,7 +120,7 @@ def test_stage_2_learns_from_pictures_and_changes_nothing_but_the_reader():
     valid = np.ones(frames.depth_THW.shape[:2], bool)
     clip = dataclasses.replace(CLIP, context=frames, context_valid_S=valid)
     mesh = one_device()
-    start = {"backbone": randomise(init_world(config, memory=False), scale=0.05)["backbone"]}
+    start = {"backbone": random_world(config, memory=False, scale=0.05)["backbone"]}
     state = step.initial_state(config, TWO, mesh, start)
     before = jax.tree.map(np.array, state.params)  # copies: the step takes the buffers
     run = step.compile_step(config, TWO, mesh, clip)

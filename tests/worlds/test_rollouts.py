@@ -12,29 +12,34 @@ from pewm_jax.memory import interface as memories
 from pewm_jax.memory import voxel_map
 from pewm_jax.types import Frames
 from pewm_jax.worlds import rollouts
-from tests.helpers import init_world, random_frames, randomise, tiny_config
+from tests.helpers import random_frames, random_world, tiny_config
 
 CONFIG = tiny_config()
 MODEL = CONFIG.model
-roll = jax.jit(rollouts.rollout, static_argnums=0, static_argnames="memory")
-start = jax.jit(worlds.start, static_argnums=0)
-ACTIONS = jnp.asarray([0, 0, 1, 0, 2, 0, 0, 1] * 2)
+ACTIONS = jnp.asarray([0, 0, 1, 0, 2, 0, 0, 1])
+KEY = jax.random.key(1)
 
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(init_world(CONFIG, jax.random.key(0)))
+    return random_world(CONFIG)
 
 
 def a_state(params, seed=0, count=3):
-    return start(CONFIG, params, random_frames(np.random.default_rng(seed), count))
+    return worlds.start(CONFIG, params, random_frames(np.random.default_rng(seed), count))
 
 
-def test_frames_come_one_per_action_along_the_integrated_poses(params):
+@pytest.fixture(scope="module")
+def rolled(params):
+    """A state, the world after ``ACTIONS``, and the frames."""
     state = a_state(params)
-    after, frames = roll(CONFIG, params, state, ACTIONS, jax.random.key(1))
-    assert frames.rgb_THWC.shape == (16, 16, 24, 3)
-    assert frames.depth_THW.shape == (16, 16, 24)
+    return state, *rollouts.rollout(CONFIG, params, state, ACTIONS, KEY)
+
+
+def test_frames_come_one_per_action_along_the_integrated_poses(rolled):
+    state, after, frames = rolled
+    assert frames.rgb_THWC.shape == (8, 16, 24, 3)
+    assert frames.depth_THW.shape == (8, 16, 24)
     moves = action_geometry.continuous(MODEL.actions, ACTIONS)
     poses = action_geometry.integrate(state.frame.camera.world_from_camera[0], moves)
     np.testing.assert_allclose(frames.camera.world_from_camera, poses[1:], atol=1e-5)
@@ -44,31 +49,33 @@ def test_frames_come_one_per_action_along_the_integrated_poses(params):
 
 @pytest.mark.slow
 def test_discrete_and_continuous_actions_agree(params):
-    state, key = a_state(params), jax.random.key(1)
-    moves = action_geometry.continuous(MODEL.actions, ACTIONS)
-    _, by_name = roll(CONFIG, params, state, ACTIONS, key)
-    _, by_number = roll(CONFIG, params, state, moves, key)
+    state, actions = a_state(params), jnp.concatenate([ACTIONS, ACTIONS[::-1]])
+    moves = action_geometry.continuous(MODEL.actions, actions)
+    _, by_name = rollouts.rollout(CONFIG, params, state, actions, KEY)
+    _, by_number = rollouts.rollout(CONFIG, params, state, moves, KEY)
     np.testing.assert_array_equal(by_name.rgb_THWC, by_number.rgb_THWC)
 
 
-def test_imagined_frames_enter_the_map_as_observed_ones_where_they_are_trusted(params):
-    state = a_state(params)
-    after, frames = roll(CONFIG, params, state, ACTIONS[:8], jax.random.key(1))
-    features = MODEL.memory.encoder.encode({}, frames.rgb_THWC)
-    trusted = memories.trusted(MODEL, frames)
-    expected = voxel_map.insert_frames(MODEL.memory, state.map, trusted, features)
+def test_imagined_frames_enter_the_map_as_observed_ones_where_they_are_trusted(rolled):
+    state, after, frames = rolled
+
+    @jax.jit
+    def inserted(memory, frames):
+        features = MODEL.memory.encoder.encode({}, frames.rgb_THWC)
+        trusted = memories.trusted(MODEL, frames)
+        return voxel_map.insert_frames(MODEL.memory, memory, trusted, features)
+
+    expected = inserted(state.map, frames)
     for name in ("cell_of_slot_V", "features_VF", "occupied"):
         np.testing.assert_array_equal(getattr(after.map, name), getattr(expected, name))
     assert int(after.map.occupied) > int(state.map.occupied)
 
 
-def test_the_map_changes_what_is_imagined_unless_ignored(params):
-    key = jax.random.key(1)
-    state = a_state(params)
+def test_the_map_changes_what_is_imagined_unless_ignored(params, rolled):
+    state, _, with_map = rolled
     emptied = dataclasses.replace(state, map=voxel_map.empty(MODEL.memory, state.map.origin_3, 6))
-    _, with_map = roll(CONFIG, params, state, ACTIONS[:8], key)
-    _, ignored = roll(CONFIG, params, state, ACTIONS[:8], key, memory=False)
-    _, without = roll(CONFIG, params, emptied, ACTIONS[:8], key)
+    _, ignored = rollouts.rollout(CONFIG, params, state, ACTIONS, KEY, memory=False)
+    _, without = rollouts.rollout(CONFIG, params, emptied, ACTIONS, KEY)
     np.testing.assert_array_equal(ignored.rgb_THWC, without.rgb_THWC)
     assert float(jnp.abs(with_map.rgb_THWC - ignored.rgb_THWC).max()) > 1e-3
 
@@ -82,9 +89,9 @@ def test_rollout_is_a_pure_function_of_its_arguments_and_vmaps(params):
     many = jax.jit(jax.vmap(lambda s, a, k: rollouts.rollout(CONFIG, params, s, a, k)))
     _, both = many(stacked, plans, keys)
     for i in range(2):
-        _, one = roll(CONFIG, params, states[i], plans[i], keys[i])
+        _, one = rollouts.rollout(CONFIG, params, states[i], plans[i], keys[i])
         np.testing.assert_allclose(both.rgb_THWC[i], one.rgb_THWC, atol=2e-3)
-        _, again = roll(CONFIG, params, states[i], plans[i], keys[i])
+        _, again = rollouts.rollout(CONFIG, params, states[i], plans[i], keys[i])
         np.testing.assert_array_equal(again.rgb_THWC, one.rgb_THWC)
 
 
@@ -116,13 +123,13 @@ def test_rollout_refuses_what_are_no_actions(params, actions):
         rollouts.rollout(CONFIG, params, a_state(params), actions, jax.random.key(0))
 
 
-def test_lists_and_numpy_arrays_are_actions_too(params):
-    state, key = a_state(params), jax.random.key(0)
-    plan = [0, 0, 1, 0, 2, 0, 0, 1]
-    expected = rollouts.rollout(CONFIG, params, state, jnp.asarray(plan), key)[1]
-    for given in (plan, np.asarray(plan, np.uint8)):
-        got = rollouts.rollout(CONFIG, params, state, given, key)[1]
-        np.testing.assert_array_equal(got.rgb_THWC, expected.rgb_THWC)
+@pytest.mark.slow(only="uint8")
+@pytest.mark.parametrize("kind", ["list", "int64", "uint8"])
+def test_lists_and_numpy_arrays_are_actions_too(params, rolled, kind):
+    state, _, expected = rolled
+    given = ACTIONS.tolist() if kind == "list" else np.asarray(ACTIONS, kind)
+    got = rollouts.rollout(CONFIG, params, state, given, KEY)[1]
+    np.testing.assert_array_equal(got.rgb_THWC, expected.rgb_THWC)
 
 
 @pytest.mark.parametrize("wrong", [3, -1])

@@ -7,7 +7,15 @@ import pytest
 
 from pewm_jax.types import Camera, Control, Frames, MapTokens, MemoryReadout
 from pewm_jax.worlds import world_model
-from tests.helpers import TINY, init_world, random_camera, randomise, rigid, with_reader
+from tests.helpers import (
+    TINY,
+    init_world,
+    random_camera,
+    random_world,
+    randomise,
+    rigid,
+    with_reader,
+)
 
 condition = jax.jit(world_model.condition, static_argnums=0)
 apply = jax.jit(world_model.apply, static_argnums=0)
@@ -52,7 +60,7 @@ def test_fresh_memory_blocks_are_exactly_the_identity(positions):
 @BOTH
 def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
     model, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(init_world(model, jax.random.key(0)))
+    params = random_world(model)
     without = apply(model, params, noisy, conditioning, times)
     empty = dataclasses.replace(tokens, valid_M=jnp.zeros_like(tokens.valid_M))
     np.testing.assert_array_equal(
@@ -71,7 +79,7 @@ def test_an_empty_map_contributes_nothing_and_has_finite_gradients(positions):
 @BOTH
 def test_masked_tokens_contribute_nothing(positions):
     model, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(init_world(model, jax.random.key(0)))
+    params = random_world(model)
     base = apply(model, params, noisy, conditioning, times, MemoryReadout(tokens))
     other = dataclasses.replace(
         tokens,
@@ -89,7 +97,7 @@ def test_masked_tokens_contribute_nothing(positions):
 @BOTH
 def test_moving_cameras_and_map_together_changes_nothing(positions):
     model, conditioning, tokens, noisy, times = setup(positions)
-    params = randomise(init_world(model, jax.random.key(0)))
+    params = random_world(model)
     base = apply(model, params, noisy, conditioning, times, MemoryReadout(tokens))
     motion = rigid(np.random.default_rng(3))
     camera = conditioning.camera
@@ -107,7 +115,7 @@ def test_moving_cameras_and_map_together_changes_nothing(positions):
 @pytest.mark.slow
 def test_each_latent_frame_looks_through_its_own_cameras():
     model, conditioning, tokens, noisy, times = setup()
-    params = randomise(init_world(model, jax.random.key(0), memory=True))
+    params = random_world(model)
     # One memory layer and no attention between frames would be needed to read this off the
     # output, so ask the geometry: only latent frame 2 (frames 5 to 8) may change with frame 6.
     from pewm_jax.readers.geometry import sightings
@@ -148,7 +156,7 @@ def test_conditioning_channels_matter_and_only_the_first_latent_frame_is_clean()
     np.testing.assert_array_equal(rays, conditioning.rays_BthwC)
     assert np.abs(first[:, 0]).max() > 0
     np.testing.assert_array_equal(first[:, 1:], 0)
-    params = randomise(init_world(model, jax.random.key(0), memory=False))
+    params = random_world(model, memory=False)
     base = apply(model, params, noisy, conditioning, times)
     for name, part in (("first", slice(channels)), ("rays", slice(channels, None))):
         halved = dataclasses.replace(

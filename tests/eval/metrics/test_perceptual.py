@@ -20,14 +20,21 @@ from pewm_jax.report.labels import format_lpips
 HIGHER = ("psnr", "ssim")
 
 
+def random_weights(net, folder):
+    path = folder / f"{net}.safetensors"
+    weights.save(path, lpips.init(net, jax.random.key(0)))
+    return path
+
+
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """Random weights of LPIPS's networks in files of ours."""
-    folder = tmp_path_factory.mktemp("weights")
-    paths = {f"lpips_{net}": folder / f"{net}.safetensors" for net in ("alex", "vgg")}
-    weights.save(paths["lpips_alex"], lpips.init("alex", jax.random.key(0)))
-    weights.save(paths["lpips_vgg"], lpips.init("vgg", jax.random.key(0)))
-    return paths
+    """Random weights of LPIPS's smaller network in a file of ours."""
+    return {"lpips_alex": random_weights("alex", tmp_path_factory.mktemp("weights"))}
+
+
+@pytest.fixture(scope="module")
+def vgg(tmp_path_factory):
+    return random_weights("vgg", tmp_path_factory.mktemp("weights"))
 
 
 def clips(count=3, frames=2, size=(40, 33)):
@@ -52,8 +59,9 @@ def blurred(truth, size):
 @pytest.mark.slow(only="vgg")
 @pytest.mark.parametrize("distort", [noisy, blurred])
 @pytest.mark.parametrize("name", ["psnr", "ssim", "lpips_alex", "lpips_vgg"])
-def test_equal_clips_are_best_and_more_distortion_is_worse(name, distort, files):
-    metric = metrics.load(name, files.get(name))
+def test_equal_clips_are_best_and_more_distortion_is_worse(name, distort, files, request):
+    path = request.getfixturevalue("vgg") if name == "lpips_vgg" else files.get(name)
+    metric = metrics.load(name, path)
     truth = clips()
     found = [np.asarray(metric(truth, truth))]
     found += [np.asarray(metric(distort(truth, size), truth)) for size in (1, 4, 12)]

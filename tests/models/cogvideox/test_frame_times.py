@@ -15,7 +15,7 @@ from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers.memory_block import MemoryBlock
 from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model
-from tests.helpers import TINY, init_world, randomise, with_reader
+from tests.helpers import TINY, random_world, randomised, with_reader
 from tests.models.cogvideox.test_model import CONFIG, inputs, random_params
 from tests.worlds.test_world_model import setup as world
 
@@ -88,7 +88,7 @@ def test_a_block_modulates_the_tokens_of_each_frame_by_its_own_time(parts):
     norm = dit_block.LayerNormZero()
     tokens = layout.arrange(draw(0, 2, 4 + FRAMES * PATCHES, WIDTH))
     times = draw(1, 2, 1 + FRAMES, TIME)
-    params = randomise(norm.init(jax.random.key(0), tokens, times, layout))
+    params = randomised(norm.init, jax.random.key(0), tokens, times, layout)
     run = jax.jit(norm.apply, static_argnums=3)
     base = run(params, tokens, times, layout)
     for row in range(1 + FRAMES):
@@ -121,7 +121,7 @@ def memory_block():
     video, camera = draw(0, 2, FRAMES * PATCHES, WIDTH), draw(1, 2, FRAMES * PATCHES, 4)
     memory = draw(2, 2, 7, reader.width)
     rest = camera, memory, jnp.ones((2, 7), bool), None
-    params = randomise(jax.jit(block.init)(jax.random.key(0), video, draw(3, 2, TIME), *rest))
+    params = randomised(block.init, jax.random.key(0), video, draw(3, 2, TIME), *rest)
     return block, params, video, rest, reader.width
 
 
@@ -156,7 +156,7 @@ def test_a_world_with_memory_takes_a_time_for_each_latent_frame(positions, patch
     backbone = dataclasses.replace(TINY.backbone, patch_t=patch_t)
     read = with_reader(TINY, positions=positions, heads=8)  # a token has up to 8 cameras
     model = dataclasses.replace(read, backbone=backbone)
-    params = randomise(init_world(model))
+    params = random_world(model)
 
     @jax.jit
     def run(times):

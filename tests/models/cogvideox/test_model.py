@@ -17,7 +17,7 @@ from pewm_jax.nn import layers
 from pewm_jax.nn.tokens import TokenLayout, patchify, unpatchify
 from pewm_jax.types import MemoryReadout
 from pewm_jax.worlds import world_model
-from tests.helpers import TINY, init_world, randomise
+from tests.helpers import TINY, random_world, randomise
 from tests.properties import examples
 from tests.worlds.test_world_model import setup as world
 
@@ -132,7 +132,7 @@ def test_a_memory_block_reads_and_writes_the_video_tokens_alone():
 
 def test_with_closed_memory_gates_stage_2_is_stage_1_and_feels_no_map():
     model, conditioning, tokens, noisy, times = world("sinusoid")
-    params = randomise(init_world(model, jax.random.key(0)))
+    params = random_world(model)
     stage1 = {"backbone": params["backbone"]}
     linear = params["memory"]["blocks"]["linear"]
     closed = jax.tree.map(jnp.zeros_like, linear)

@@ -17,7 +17,7 @@ from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.worlds import world_model
-from tests.helpers import randomise
+from tests.helpers import randomised
 from tests.properties import examples
 
 TABLE = dataclasses.replace(
@@ -44,7 +44,7 @@ def choose(learned):
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(jax.jit(dit.init, static_argnums=0)(TABLE, jax.random.key(0)))
+    return randomised(dit.init, TABLE, jax.random.key(0))
 
 
 def run(config, params, shape):

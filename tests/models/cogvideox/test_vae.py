@@ -14,7 +14,7 @@ from pewm_jax.models.cogvideox import vae, vae_layers
 from pewm_jax.models.cogvideox.convert import VAE
 from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.nn import layers, video_convolution
-from tests.helpers import randomise
+from tests.helpers import randomised
 
 TINY = VAECodec(
     widths=(4, 4, 4), resnets=1, groups=2, latent_channels=2, sample_height=16, sample_width=16
@@ -23,7 +23,7 @@ TINY = VAECodec(
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(jax.jit(vae.init, static_argnums=0)(TINY, jax.random.key(0)), scale=0.3)
+    return randomised(vae.init, TINY, jax.random.key(0), scale=0.3)
 
 
 def video(frames, height=8, width=8, seed=0):

@@ -140,6 +140,7 @@ def test_patch_tokens_equal_the_reference_at_every_size(pair):
         assert np.abs(got - want).max() <= 1e-5 * np.abs(want).max(), size
 
 
+@pytest.mark.slow(only=("base", "large"))
 def test_the_class_token_equals_the_reference(pair):
     network, _, (config, params) = pair
     batch = images((42, 98))

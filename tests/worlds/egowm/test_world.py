@@ -21,7 +21,7 @@ from pewm_jax.planning import imagined_env
 from pewm_jax.types import Camera, Control
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
-from tests.helpers import init_world, random_frames, randomise
+from tests.helpers import random_frames, random_world
 
 MODEL = EgoWM(
     clip=ClipConfig(frames=5, height=16, width=16, depth=False),
@@ -48,7 +48,7 @@ def seen(count=4, seed=0):
 
 @pytest.fixture(scope="module")
 def params():
-    return randomise(init_world(MODEL, memory=False))
+    return random_world(MODEL, memory=False)
 
 
 @pytest.fixture(scope="module")
