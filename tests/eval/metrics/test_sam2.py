@@ -102,7 +102,7 @@ def test_it_follows_as_the_reference_does(folder):
             )[:, 0].numpy()
             for each in network.propagate_in_video_iterator(session)
         ]
-    found = np.stack(list(sam2._followed(network, video, first)))
+    found = np.stack(list(sam2._track(network, video, first)))
     np.testing.assert_allclose(found, np.stack(wanted), rtol=1e-4, atol=1e-4)
     assert np.ptp(found[1]) > 0
 
