@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -68,9 +69,10 @@ def _encode(
     with _reading(tokenizer, "a tokenizer"):
         tokenize = transformers.AutoTokenizer.from_pretrained(tokenizer, local_files_only=True)
     with _reading(encoder, "a T5 encoder"):
-        model, report = transformers.T5EncoderModel.from_pretrained(
+        loaded: Any = transformers.T5EncoderModel.from_pretrained(
             encoder, local_files_only=True, dtype="auto", output_loading_info=True
         )
+        model, report = loaded
     wrong = {*report["missing_keys"], *report["unexpected_keys"]}
     if wrong:
         raise UserError(

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import jax
@@ -113,7 +113,7 @@ def mlp_shapes(path: str, inward: int, width: int) -> Iterator[Leaf]:
     yield from parameters.linear(f"{path}/two", width, width)
 
 
-def init(config: BlocksConfig, parts: Parts, ends: Iterator[Leaf], key: Array) -> Params:
+def init(config: BlocksConfig, parts: Parts, ends: Iterable[Leaf], key: Array) -> Params:
     """Return random parameters: blocks stacked over layers, and ends of these shapes.
 
     The layers of the modulation and the last layer are zero, the gates follow ``config.gates``.

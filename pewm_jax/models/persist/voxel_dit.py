@@ -124,7 +124,8 @@ def apply(
         cache=cache,
     )
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
-    out = unpatchify(out, *(config.latent_side,) * 3, config.patch, config.patch)
+    side = config.latent_side
+    out = unpatchify(out, side, side, side, config.patch, config.patch)
     return out.reshape(latents_BTxyzC.shape), cache
 
 

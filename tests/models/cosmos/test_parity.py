@@ -268,7 +268,7 @@ def test_every_tensor_must_be_used_and_there(pair, tmp_path):
         ("patch_size", [1, 2, 1], "only square patches"),
         ("rope_scale", [1, 3], r"a value like \(2.0, 1.0, 1.0\)"),
         ("num_layers", 2.5, "a value like 28"),
-        ("extra_pos_embed_type", "sincos", "only None and 'learnable'"),
+        ("extra_pos_embed_type", "sincos", "supported are None, learnable"),
         ("attention_head_dim", 10, "head_dim is 10"),
     ],
 )

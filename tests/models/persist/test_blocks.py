@@ -172,7 +172,7 @@ def test_a_hidden_picture_does_not_matter_and_a_shown_one_does():
 
 def test_networks_begin_at_zero_and_blocks_as_the_identity():
     x, condition = normal(0, 1, 2, 3, 16), normal(1, 1, 2, 16)
-    ends = frame_blocks.end_shapes(16, 5)
+    ends = list(frame_blocks.end_shapes(16, 5))
 
     @jax.jit
     def both(key):
