@@ -38,8 +38,8 @@ from pewm_jax.plan import plan
 from pewm_jax.plan.measure import MeshSizes
 from pewm_jax.train import chips, flops, sharding, step
 from pewm_jax.types import Clip
-from pewm_jax.worlds import stages
 from pewm_jax.worlds.pewm.world import STAGES
+from pewm_jax.worlds.stages import Stage
 
 NAME = "training_gpu"
 BATCHES = (1, 2, 4, 8, 16, 32)
@@ -48,7 +48,7 @@ HEADER += ("peak memory, GB", "of that state and gradients", "compile, s")
 FULL = "out of memory"
 
 
-def setting(preset: str, stage: stages.Stage, batch: int) -> Config:
+def setting(preset: str, stage: Stage, batch: int) -> Config:
     """Return a preset's configuration for one device and so many clips a step."""
     config = configs.load(preset)
     changed = dataclasses.replace(stage.settings(config), batch=batch)
@@ -56,7 +56,7 @@ def setting(preset: str, stage: stages.Stage, batch: int) -> Config:
     return dataclasses.replace(config, train=dataclasses.replace(config.train, **changes))
 
 
-def random_clip(config: Config, stage: stages.Stage) -> Clip:
+def random_clip(config: Config, stage: Stage) -> Clip:
     """Return a batch of noise with cameras that look ahead and depths of a room."""
     rng = np.random.default_rng(0)
 
@@ -76,7 +76,7 @@ def random_clip(config: Config, stage: stages.Stage) -> Clip:
     return jax.tree.map(draw, abstract.clip(config, batch, features=stage.memory))
 
 
-def predicted(config: Config, stage: stages.Stage, chip: chips.Chip) -> dict[str, float]:
+def predicted(config: Config, stage: Stage, chip: chips.Chip) -> dict[str, float]:
     """Return what ``--plan --compiled off`` says of one device."""
     found = plan.plan_stage(config, stage, MeshSizes(), chip, compiles=False).choice
     return {

@@ -112,8 +112,8 @@ def _seating(
     piece.box((-half + 0.18, half - 0.18), (0.24, depth - 0.02), (0.06, 0.3), shade(cloth, 0.8))
     for k in range(seats):
         x = -inner / 2 + k * inner / seats
-        seat = (x + 0.01, x + inner / seats - 0.01)
-        piece.box(seat, (0.24, depth), (0.3, 0.45), shade(cloth, 1.15))
+        cushion = (x + 0.01, x + inner / seats - 0.01)
+        piece.box(cushion, (0.24, depth), (0.3, 0.45), shade(cloth, 1.15))
     for k in range(seats):
         if seats == 1 or rng.uniform() < 0.7:
             x = -inner / 2 + (k + 0.5) * inner / seats

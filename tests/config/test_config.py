@@ -94,7 +94,7 @@ def model_of(memory, codec=None):
         (lambda: TrainConfig(seed=-1), "train.seed is -1"),
         (lambda: TrainConfig(weight_decay=-0.1), "train.weight_decay is -0.1"),
         (lambda: TrainConfig(preview_every=-1), "train.preview_every is -1"),
-        (lambda: TrainConfig(stage1=StageConfig(steps=0)), "give train.stage1.steps at least 1"),
+        (lambda: TrainConfig(stage1=StageConfig(steps=0)), "set train.stage1.steps at least 1"),
         (lambda: TrainConfig(ema=1.0), "decay"),
         (lambda: TrainConfig(clip_norm=0), "above 0"),
         (lambda: EvalConfig(seeds=()), "at least one seed"),
@@ -166,7 +166,7 @@ def test_what_the_checks_must_not_refuse():
         ({"model": {"noise": {"kind": "none"}}}, "noise.kind: There is no noise of kind 'none'"),
         (
             {"model": {"memory": {"kind": 3}}},
-            "there is grid, images, map2d, .*none, points, .*voxel",
+            "the kinds are grid, images, map2d, .*none, points, .*voxel",
         ),
         ({"model": {"memory": {"reader": {"kind": "?"}}}}, "memory.reader.kind: There is no"),
         ({"train": {"stage3": {}}}, "config.json.train has no setting stage3"),

@@ -187,7 +187,7 @@ def test_the_share_is_that_of_clips_on_average(monkeypatch, world):
     def black(model, params, frames, *_):
         return 0 * frames.rgb_THWC[:, :1], 0 * frames.depth_THW[:, :1]
 
-    monkeypatch.setattr(chained, "_looking_back", black)
+    monkeypatch.setattr(chained, "_predict_backwards", black)
 
     @jax.jit
     @jax.vmap

@@ -33,8 +33,8 @@ from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.plan import plan
 from pewm_jax.train import loading, loop, runs, step
-from pewm_jax.worlds import stages
 from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
+from pewm_jax.worlds.stages import FREEZE, TRAIN
 from tests.helpers import random_camera
 
 TINY = LearnedCodecConfig(latent_channels=4, fine=8, coarse=12, fine_blocks=1, coarse_blocks=1)
@@ -83,7 +83,7 @@ def descend(config, params, stage, count, rate, clips_of):
     rule = optax.masked(
         optax.adam(rate),
         lambda p: tree.assign(
-            [(pattern, label == stages.TRAIN) for pattern, label in stage.rules], p, "mask"
+            [(pattern, label == TRAIN) for pattern, label in stage.rules], p, "mask"
         ),
     )
 
@@ -93,7 +93,7 @@ def descend(config, params, stage, count, rate, clips_of):
             lambda p: stage.loss(config.model, config.train, p, clip, key), has_aux=True
         )
         measured, slope = loss(params)
-        kept = tree.assign([(p, float(k == stages.TRAIN)) for p, k in stage.rules], slope, "mask")
+        kept = tree.assign([(p, float(k == TRAIN)) for p, k in stage.rules], slope, "mask")
         slope = jax.tree.map(lambda x, k: x * k, slope, kept)
         move, state = rule.update(slope, state, params)
         return optax.apply_updates(params, move), state, measured
@@ -213,7 +213,7 @@ def test_lpips_can_be_descended(tmp_path):
 
 def with_given(stage):
     """The stage with rules that freeze what is given, which the trainer keeps apart."""
-    return dataclasses.replace(stage, rules=((r"lpips/.*", stages.FREEZE), *stage.rules))
+    return dataclasses.replace(stage, rules=((r"lpips/.*", FREEZE), *stage.rules))
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ import numpy as np
 from pewm_jax import presets as configs
 from pewm_jax.io import tree, weights
 from pewm_jax.train import loop, runs, sharding
-from pewm_jax.worlds import stages
 from pewm_jax.worlds.pewm import world as pewm
+from pewm_jax.worlds.stages import TRAIN
 from tests.train import fakes
 
 JOINT = pewm.STAGES[2]
@@ -63,7 +63,7 @@ def test_joint_trains_backbone_and_memory_and_not_the_codec_with_its_gate():
     labels = tree.flatten(JOINT.labels(params))
     assert any(path.startswith("codec/gate/") for path in labels)
     for path, label in labels.items():
-        assert (label == stages.TRAIN) == path.startswith(("backbone/", "memory/")), path
+        assert (label == TRAIN) == path.startswith(("backbone/", "memory/")), path
 
 
 def test_optional_stages_are_left_out_without_steps():

@@ -11,8 +11,8 @@ from pewm_jax import presets as configs
 from pewm_jax.io import tree
 from pewm_jax.train import optimizer
 from pewm_jax.train.signals import Interrupted
-from pewm_jax.worlds import stages
 from pewm_jax.worlds.pewm.world import STAGES
+from pewm_jax.worlds.stages import TRAIN
 from tests.train import fakes
 from tests.train.test_loop import StopAt, file_bytes, losses, train
 from tests.train.test_step import run
@@ -44,7 +44,7 @@ def test_every_trained_leaf_has_exactly_one_of_the_two(name, stage):
     params = shapes(name, stage)
     of = moments(jax.eval_shape(optimizer.make(config, stage).init, params))
     labels = tree.flatten(stage.labels(params))
-    trained = {path for path, label in labels.items() if label == stages.TRAIN}
+    trained = {path for path, label in labels.items() if label == TRAIN}
     assert of["muon"].isdisjoint(of["adam"])
     assert of["muon"] | of["adam"] == trained
     for path in of["muon"]:

@@ -14,8 +14,9 @@ from pewm_jax.io import tree
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.train import optimizer, sharding, step
 from pewm_jax.train import step as state
-from pewm_jax.worlds import stages, world_model
+from pewm_jax.worlds import world_model
 from pewm_jax.worlds.pewm import world as pewm
+from pewm_jax.worlds.stages import TRAIN
 from tests.train import fakes
 
 ONE, TWO = fakes.STAGES[:2]
@@ -155,7 +156,7 @@ def test_freezing_the_backbone_makes_the_step_of_the_real_model_cheaper():
     def flops(stage):
         return step.trace_step(config, stage, mesh, clip).lower().cost_analysis()["flops"]
 
-    everything = dataclasses.replace(REAL, rules=((r".*", stages.TRAIN),))
+    everything = dataclasses.replace(REAL, rules=((r".*", TRAIN),))
     assert flops(REAL) < 0.85 * flops(everything)
 
 
@@ -164,7 +165,7 @@ def test_the_stages_cover_the_parameters_of_the_real_model():
     params = jax.eval_shape(make, jax.random.key(0))
     assert set(tree.select(params, REAL.trained)) == {"memory"}
     labels = tree.flatten(REAL.labels(params))
-    assert {p for p, label in labels.items() if label == stages.TRAIN} == {
+    assert {p for p, label in labels.items() if label == TRAIN} == {
         p for p in labels if p.startswith("memory/")
     }
     with pytest.raises(tree.TreeError, match="rules of stage2 matches stranger"):

@@ -14,12 +14,13 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import sharding, step
 from pewm_jax.types import Clip
-from pewm_jax.worlds import stages, world_model
+from pewm_jax.worlds import world_model
 from pewm_jax.worlds.pewm.world import STAGES
+from pewm_jax.worlds.stages import TRAIN
 from tests.helpers import random_frames, random_world, with_reader
 
 TWO = STAGES[1]
-EVERYTHING = dataclasses.replace(TWO, rules=((r".*", stages.TRAIN),))
+EVERYTHING = dataclasses.replace(TWO, rules=((r".*", TRAIN),))
 
 
 def small():
@@ -96,7 +97,7 @@ def test_every_leaf_has_a_rule_and_one_without_fails(stage):
         params["codec"] = {"gate": {"kernel": 0}, "decoder": {"kernel": 0}}
     labels = tree.flatten(stage.labels(params))
     trained, frozen = tree.split(params, stage.trained)
-    train = {path for path, label in labels.items() if label == stages.TRAIN}
+    train = {path for path, label in labels.items() if label == TRAIN}
     assert tree.flatten(trained).keys() == train
     assert tree.flatten(frozen).keys() == labels.keys() - train
     with pytest.raises(tree.TreeError, match="matches memroy/gate"):

@@ -1,6 +1,5 @@
 """DINOv2 equals transformers', in every form and read from either kind of file."""
 
-import dataclasses
 import json
 
 import jax
@@ -16,6 +15,7 @@ from transformers import (
 )
 
 from pewm_jax.convert import dinov2, pipeline
+from pewm_jax.io import sources
 from pewm_jax.models.dinov2 import model
 from pewm_jax.models.dinov2.config import published
 from pewm_jax.models.dinov2.convert import with_transformers_names
@@ -190,25 +190,19 @@ def test_published_sizes_have_the_reference_s_tensors(size, registers):
         )
     like = jax.eval_shape(lambda: model.init(config, jax.random.key(0)))
     assembled = pipeline.expected(dinov2.entries(config), like)
-    source = with_transformers_names(_Shapes(original_words(network)))
+    source = with_transformers_names(
+        sources.in_memory(
+            {
+                name: jax.ShapeDtypeStruct(tuple(x.shape), np.float32)
+                for name, x in original_words(network).items()
+            },
+            "meta",
+        )
+    )
     assert assembled == {name: source.shape(name) for name in source.names()}
     assert sum(np.prod(shape) for shape in assembled.values()) + config.width == sum(
         parameter.numel() for parameter in network.parameters()
     )
-
-
-@dataclasses.dataclass
-class _Shapes:
-    """A source of tensors without values."""
-
-    tensors: dict
-    where: str = "meta"
-
-    def names(self):
-        return self.tensors.keys()
-
-    def shape(self, name):
-        return tuple(self.tensors[name].shape)
 
 
 def test_an_image_classifier_is_read_by_its_body(pair, tmp_path):

@@ -162,7 +162,7 @@ def test_its_settings_travel_and_what_cannot_work_is_refused():
     ):
         with pytest.raises(ConfigError, match=re.escape(says)):
             dataclasses.replace(MODEL, **changes)
-    with pytest.raises(ConfigError, match="no memory to hide"):
+    with pytest.raises(ConfigError, match="cannot be run backwards"):
         EgoWMTrainConfig(chained=0.5)
     with pytest.raises(UserError, match="colours"):
         pewm_jax.start(MODEL, {}, random_frames(np.random.default_rng(0), 2))
