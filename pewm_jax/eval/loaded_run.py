@@ -58,6 +58,8 @@ def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
         UserError: it is missing, damaged, or of a world without reports.
     """
     folder = shipped.find(run)
+    if folder.is_file():
+        raise UserError(f"{run} is a file; give the folder of a run.")
     if not folder.is_dir():
         raise UserError(f"{run} does not exist; train a model first, e.g. `pewm-jax train demo`.")
     config, params = load_finished(folder, config=config)

@@ -539,6 +539,8 @@ def refused(command, arguments, capsys):
 
 def test_bad_input_ends_in_one_sentence(copied, command, capsys, tmp_path):
     assert "does not exist" in refused(command, [str(tmp_path / "nothing")], capsys)
+    (tmp_path / "a.json").write_text("{")
+    assert "a.json is a file" in refused(command, [str(tmp_path / "a.json")], capsys)
     assert "missing does not exist" in refused(
         command, [str(copied), "--data", str(tmp_path / "missing"), "--split", ""], capsys
     ).replace("/ ", " ")
