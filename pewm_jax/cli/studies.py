@@ -91,8 +91,8 @@ class Table2Settings:
     """A run's folder, or a model that ships with the library."""
     out: Path = Path("runs/table2")
     """Folder of the results."""
-    tasks: int = 48
-    """Number of tasks, spread evenly over the houses."""
+    tasks: tuple[int, ...] = (48,)
+    """Number of tasks, spread evenly over the houses: one, or one for each of --multiples."""
     houses: int = 24
     """Number of held-out houses."""
     proposals: tuple[int, ...] = (8, 16)
@@ -121,9 +121,16 @@ class Table2Settings:
 
 def table2(settings: Table2Settings) -> None:
     """Write the table and print its path."""
-    for name in ("tasks", "houses", "videos"):
+    for name in ("houses", "videos"):
         if getattr(settings, name) < (name != "videos"):
             raise ConfigError(f"--{name} is {getattr(settings, name)}: give at least 1.")
+    if min(settings.tasks, default=0) < 1 or len(settings.tasks) not in (
+        1,
+        len(settings.multiples),
+    ):
+        raise ConfigError(
+            "--tasks needs one number of 1 or more, or one for each of --multiples, such as 48 8 8."
+        )
     counts = settings.proposals
     if not counts or min(counts) < 1 or len(set(counts)) < len(counts):
         raise ConfigError(

@@ -71,6 +71,7 @@ class Table2Config:
     """The settings of a table.
 
     Attributes:
+        tasks: number of tasks at each distance, one for all or one for each of ``multiples``.
         houses: number of held-out houses, which tasks use in turn.
         proposals: numbers of a policy's proposals that are ranked.
         plan: settings of the planner.
@@ -79,7 +80,7 @@ class Table2Config:
         none: a run that was trained without memory, or "".
     """
 
-    tasks: int = 48
+    tasks: tuple[int, ...] = (48,)
     houses: int = 24
     proposals: tuple[int, ...] = (8, 16)
     plan: PlanConfig = dataclasses.field(default_factory=PlanConfig)
@@ -88,6 +89,11 @@ class Table2Config:
     videos: int = 3
     multiples: tuple[int, ...] = (1, 2, 3)
     none: str = ""
+
+    def tasks_by_multiple(self) -> dict[int, int]:
+        """Return the number of tasks of each of ``multiples``."""
+        counts = self.tasks * len(self.multiples) if len(self.tasks) == 1 else self.tasks
+        return dict(zip(self.multiples, counts, strict=True))
 
 
 def run(
@@ -133,13 +139,13 @@ def run(
         _require_alike(none, opened, study.none, model)
     predictors = Predictors(config, params, none=(none.config, none.params) if none else None)
     methods = deciders.method_names(study.proposals, predictors.names)
-    count = len(study.multiples) * study.tasks * len(methods)
+    count = sum(study.tasks_by_multiple().values()) * len(methods)
     by_distance: dict[int, dict[str, list[dict[str, Any]]]] = {}
     with Meter("deciding", count, "decisions") as meter:
-        for times in study.multiples:
+        for times, tasks in study.tasks_by_multiple().items():
             made: dict[str, list[dict[str, Any]]] = {name: [] for name in methods}
             by_distance[times * study.plan.actions] = made
-            for number in range(study.tasks):
+            for number in range(tasks):
                 goal: Goal | None = None
                 for name in methods:
                     if name == "policy" and times > 1:
@@ -280,7 +286,7 @@ def _videos(
 ) -> list[Path]:
     """Write videos of the imagined plan and the real frames, side by side."""
     files = []
-    for number in range(min(study.videos, study.tasks)):
+    for number in range(min(study.videos, len(made["mpc-memory"]))):
         actions = np.array(made["mpc-memory"][number]["actions"])
         file = out / f"plan{number}.mp4"
         if not file.exists():
@@ -389,7 +395,9 @@ def markdown(results: Mapping[str, Any], stem: str, videos: Sequence[Path]) -> s
 def _farther(results: Mapping[str, Any]) -> list[str]:
     """Return a section for each distance but the first."""
     return [
-        f"## Goals {actions} actions away\n\n{scores_table(found, seconds=True).markdown()}"
+        f"## Goals {actions} actions away\n\n"
+        f"{found['tasks']} tasks in {found['houses']} houses.\n\n"
+        f"{scores_table(found, seconds=True).markdown()}"
         for actions, found in list(results.get("distances", {}).items())[1:]
     ]
 

@@ -22,7 +22,7 @@ from tests.helpers import init_world, random_world
 MOTION = ActionConfig()
 PLAN = PlanConfig(horizon=4, candidates=6, elites=2, rounds=2)
 ERRAND = table2.Table2Config(
-    tasks=3,
+    tasks=(3, 2),
     houses=2,
     proposals=(2,),
     plan=PLAN,
@@ -57,7 +57,7 @@ def test_the_whole_table_is_made(made):
     names = deciders.method_names((2,))
     assert tuple(results["rows"]) == names
     assert set(results["memory_minus_empty"]) == {"rank2", "mpc", "loop"}
-    assert set(results["distances"]) == {"4", "8"}
+    assert {far: found["tasks"] for far, found in results["distances"].items()} == {"4": 3, "8": 2}
     assert set(results["distances"]["8"]["rows"]) == set(names) - {"policy"}
     assert set(results["curves"]["mpc-memory"]) == {"6", "12"}
     text = page.read_text()
@@ -184,7 +184,8 @@ def test_ranking_takes_the_best_proposal():
     [
         (["--policy", "nothing"], "--policy nothing is neither one of wander"),
         (["--policy", "json:nothing"], "json has no function nothing"),
-        (["--tasks", "0"], "--tasks is 0"),
+        (["--tasks", "0"], "--tasks needs one number of 1 or more"),
+        (["--tasks", "4", "2"], "--tasks needs one number of 1 or more, or one for each"),
         (["--proposals", "0"], "--proposals needs distinct numbers of 1 or more"),
         (["--proposals", "8", "8"], "--proposals needs distinct numbers of 1 or more"),
         (["--elites", "99"], "plan.elites is 99"),
@@ -259,7 +260,7 @@ def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
     weights.save(tmp_path / "none" / "weights.safetensors", params)
     configuration.save(config, tmp_path / "none" / "config.json")
     errand = dataclasses.replace(
-        ERRAND, tasks=1, videos=0, multiples=(1,), none=str(tmp_path / "none")
+        ERRAND, tasks=(1,), videos=0, multiples=(1,), none=str(tmp_path / "none")
     )
     page = table2.run(
         folder / "run", tmp_path / "out", errand, deciders.wanderer, costs.Pixels(), lambda _: None
