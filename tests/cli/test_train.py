@@ -445,6 +445,7 @@ def test_told_to_end_while_it_compiles_then_trained_without_a_record_that_is_dam
     assert list((tmp_path / "runs" / "it" / "profile").rglob("*.xplane.pb"))
 
 
+@pytest.mark.slow
 def test_absent_data_are_a_sentence_and_the_run_can_be_started_again(tmp_path):
     argv = ["tiny", "--data.path", tmp_path / "none", "--train.run", tmp_path / "runs" / "it"]
     code, _, err = finish(start(*argv))

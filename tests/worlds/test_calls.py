@@ -152,6 +152,7 @@ def test_they_can_be_called_under_vmap_and_grad():
     assert np.abs(slope).max() > 0
 
 
+@pytest.mark.slow(only="persist")
 @EVERY_WORLD
 @pytest.mark.parametrize(
     ("control", "says"),
@@ -282,6 +283,7 @@ def stays_nan(kind, imagine, control):
     equal(looked.map, state.map)
 
 
+@pytest.mark.slow(but="control0")
 @pytest.mark.parametrize(
     "control", [BAD, [0, 0, 0, 0, -1], np.float32([[0.1, 0, 0], [0, np.nan, 0]])]
 )
@@ -295,12 +297,14 @@ def unchecked(monkeypatch):
     monkeypatch.setattr(checks, "check_control", lambda control, who: jnp.asarray(control))
 
 
+@pytest.mark.slow(only="persist")
 @EVERY_WORLD
 @pytest.mark.usefixtures("unchecked")
 def test_in_every_world_an_unknown_action_gives_nan_and_leaves_the_memory(kind):
     stays_nan(kind, worlds.imagine, BAD)
 
 
+@pytest.mark.slow(only="persist")
 @EVERY_WORLD
 @pytest.mark.usefixtures("unchecked")
 def test_an_unknown_action_spoils_its_own_candidate_alone(kind):
@@ -315,6 +319,7 @@ def test_an_unknown_action_spoils_its_own_candidate_alone(kind):
         equal(third, jax.tree.map(lambda x: x[2], wanted))
 
 
+@pytest.mark.slow
 def test_an_unknown_action_spoils_the_last_frame_of_its_candidate():
     model, params, state = made("pewm")
     many = jax.jit(functools.partial(worlds.imagine_many, last=True), static_argnums=0)
@@ -324,6 +329,7 @@ def test_an_unknown_action_spoils_the_last_frame_of_its_candidate():
     assert all_nan(second)
 
 
+@pytest.mark.slow(only="persist")
 @EVERY_WORLD
 def test_a_step_by_an_unknown_action_is_refused_or_shows_no_depth(kind, monkeypatch):
     model, params, _ = made(kind)
@@ -451,6 +457,7 @@ def test_frames_of_no_camera_are_refused_in_a_sentence(name, on_device):
         assert "\n" not in told
 
 
+@pytest.mark.slow(only="persist")
 @pytest.mark.parametrize("kind", ["egowm", "persist"])
 @pytest.mark.parametrize("name", ["bytes as floats", "millimetres", "NaN pose", "NaN depth"])
 def test_every_world_refuses_them(kind, name):

@@ -115,6 +115,7 @@ def test_no_frame_depends_on_later_actions(params, state):
     assert np.any(one.rgb_THWC[2] != two.rgb_THWC[2])
 
 
+@pytest.mark.slow
 def test_the_camera_model_steers(params, state, walked):
     poses = action_geometry.integrate(state.frame.camera.world_from_camera[0], MOVES)[1:]
     made = walked[1].camera.world_from_camera

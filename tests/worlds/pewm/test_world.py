@@ -162,6 +162,7 @@ def round_trip(count=3):
     return dataclasses.replace(frames, camera=camera)
 
 
+@pytest.mark.slow(but="voxel")
 @pytest.mark.parametrize("kind", ["voxel", "map2d", "none"])
 def test_observing_later_is_observing_at_the_start(params, kind):
     model = dataclasses.replace(MODEL, memory=model_of(kind).memory)
