@@ -103,7 +103,8 @@ class Clip:
             * ``state_A`` (..., A) the agent's own state at frame 0.
 
             A stage's ``prepare`` adds what it computes from frozen weights, under names of its
-            world (``worlds.objective.prepare``: ``latents_thwC`` and ``readout``).
+            world (``worlds.objective.prepare``: ``latents_thwC``, ``readout`` and
+            ``everywhere_thwC``).
     """
 
     frames: Frames

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
 from pewm_jax.config.world import (
@@ -24,12 +24,23 @@ if TYPE_CHECKING:
     from pewm_jax.types import Array
 
 
+WhereObserved: TypeAlias = Literal["first", "every", "warped"]
+"""Where the observed frame conditions a clip: at its own latent frame alone; at every latent frame,
+as it is; or at every one, rendered from the camera of that frame by its depth."""
+
+
 @dataclasses.dataclass(frozen=True)
 class AssembledModel(World):
     """Base class of the worlds that are assembled from parts.
 
     A backbone denoises the latents of a codec, steered by a control; a reader reads a memory.
+
+    Attributes:
+        observed: where the observed frame conditions a clip, a ``WhereObserved``; a setting of the
+            worlds that declare this field.
     """
+
+    observed = "first"  # without an annotation this is no field
 
     clip: ClipConfig = ClipConfig()
     """Shape of a clip."""
@@ -56,8 +67,13 @@ class AssembledModel(World):
     @property
     def in_channels(self) -> int:
         """Input channels of the denoiser: of noisy latents, observed frames and control."""
-        shown = self.backbone.shown_channels(self)
+        shown = self.backbone.shown_channels(self) + self.everywhere_channels
         return self.codec.channels + shown + self.control.channels(self)
+
+    @property
+    def everywhere_channels(self) -> int:
+        """Input channels of the observed frame at every latent frame: its latents and a mask."""
+        return 0 if self.observed == "first" else self.codec.channels + 1
 
     @property
     def batch_spec(self) -> BatchSpec:
@@ -155,3 +171,12 @@ class AssembledModel(World):
         parts: tuple[Any, ...] = (self.backbone, self.codec, self.control, self.memory, self.noise)
         for settings in parts:
             settings.check(self)
+        require(
+            self.observed in ("first", "every", "warped"),
+            f"model.observed is {self.observed!r}; choose first, every or warped.",
+        )
+        require(
+            self.observed != "warped" or self.clip.depth,
+            "model.observed is warped, which needs the depth of the observed frame, and clip.depth "
+            "is false, so imagined frames have none: use model.observed every.",
+        )

@@ -604,11 +604,15 @@ class Noise(Settings):
         guidance: classifier-free guidance on the memory, or in a world without one on the observed
             image, or on the text where the backbone says so; 1 is off.
         per_frame: whether training draws a time for every latent frame.
+        rendered_until: the time down to which sampling keeps latents that the rendered memory
+            covers; 0 for never. ``sample`` of a kind that has it takes the argument ``held``:
+            ``(latents_BthwC, covered_Bthw1)``.
     """
 
     SECTION: ClassVar[str] = "noise"
     guidance: Any = 1.0
     per_frame: Any = False
+    rendered_until: Any = 0.0
 
     @property
     def velocity_in_unit_time(self) -> bool:

@@ -12,6 +12,10 @@ AXES = ("data", "fsdp", "tensor", "context")
 """The mesh axes, outermost first; devices along the last ones communicate most."""
 
 
+SHARES = ("hidden", "memory_errors", "chained")
+"""Settings of training that are shares of clips."""
+
+
 @dataclasses.dataclass(frozen=True)
 class MeshConfig:
     """The number of devices along each mesh axis; their product is the number of devices."""
@@ -175,6 +179,10 @@ class TrainSettings:
     hidden: float = 0.0
     """Share of clips whose memory is hidden in training, so that the model also works without one;
     for stages that train the backbone with a memory."""
+    memory_errors: float = 0.0
+    """Share of clips whose rendered memory gets errors in training: wrong, displaced and missing
+    surfels, shifted depth, and the errors of depth cameras (`worlds/perturbation.py` lists them
+    with their sizes)."""
     chained: float = 0.0
     """Share of clips that start from a frame predicted by the model, as all clips but the first do
     in a rollout: the clip is run backwards in one denoising step from a random level of noise, and
@@ -197,7 +205,7 @@ class TrainSettings:
             (lambda x: x >= 0, "0 (no pictures) or more steps", "preview_every"),
             (lambda x: x > 0, "more than 0 seconds", "grace_s"),
             (lambda x: 0 <= x < 1, "a share of the depth in [0, 1)", "depth_noise"),
-            (lambda x: 0 <= x <= 1, "a share of clips in [0, 1]", "hidden", "chained"),
+            (lambda x: 0 <= x <= 1, "a share of clips in [0, 1]", *SHARES),
         ):
             require_fields(self, "train", accepts, hint, *names)
         for name, reason in self.ZERO.items():

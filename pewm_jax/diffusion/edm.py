@@ -10,7 +10,7 @@ x / (1 + σ) = (1 − τ) x0 + τ ε and τ, and predicts ε − x0.
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,11 @@ class EDMConfig(Noise):
     sigma_min, one evaluation of the network less."""
     sampler: Literal["euler", "heun"] = "euler"
     """`euler`: first order, one evaluation of the denoiser per step. `heun`: second order, two."""
+    rendered_until: float = 0.0
+    """σ down to which sampling keeps the latents that the rendered memory covers at those of the
+    rendering, with the noise of each level; below it they are free. Holes start from pure noise. 0:
+    everything starts from pure noise. Training does not depend on it. About 1 lets the model revise
+    what the memory shows but not move it."""
     guidance: float = 1.0
     """Classifier-free guidance on the memory (in the world egowm: on the observed image, or on the
     text of Cosmos): 1 = off, above 1 pushes away from 'no memory'."""
@@ -66,6 +71,10 @@ class EDMConfig(Noise):
             "noise.sigma_data and noise.rho must be above 0, and noise.log_std at least 0.",
         )
         require(
+            self.rendered_until >= 0,
+            f"noise.rendered_until is {self.rendered_until}: use a σ above 0, or 0 for never.",
+        )
+        require(
             self.target != "flow" or self.sigma_data == 1,
             f"noise.sigma_data is {self.sigma_data}: noise.target flow goes with 1.",
         )
@@ -73,6 +82,17 @@ class EDMConfig(Noise):
             self.ends != "sigma_min" or self.sample_steps >= 2,
             "noise.sample_steps is 1: with noise.ends sigma_min use at least 2, or nothing is "
             "denoised.",
+        )
+
+    def check(self, model: Any) -> None:
+        """Refuse to keep latents of a memory that is not rendered in colours."""
+        super().check(model)
+        memory = model.memory
+        require(
+            not self.rendered_until
+            or (memory.REMEMBERS and not memory.KEEPS_FEATURES and memory.reader.READS_VIEW),
+            f"noise.rendered_until is {self.rendered_until}, and this model's memory is not "
+            "rendered in colours: use memory.kind surfels with memory.reader.kind render, or 0.",
         )
 
     @property
@@ -115,13 +135,29 @@ class EDMConfig(Noise):
         share = np.linspace(0, 1, self.sample_steps)
         return (high + share * (low - high)) ** self.rho
 
-    def sample(self, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
+    def sample(
+        self,
+        denoise: Denoiser,
+        noise: Array,
+        key: Array | None = None,
+        *,
+        held: tuple[Array, Array] | None = None,
+    ) -> Array:
         """Follow the probability-flow ODE by Euler's or Heun's method (Alg. 1).
 
-        The ODE is dx/dσ = (x − x0) / σ.
+        The ODE is dx/dσ = (x − x0) / σ. ``held`` is (B, t, …) latents and a mask that broadcasts
+        with them: where it is True, x is latents + σ · noise at every σ ≥ ``rendered_until``. As
+        the level is that of the whole clip, the network gets inputs as in training.
         """
         del key
         sigmas = np.asarray(self.levels(), np.float32)
+
+        def kept(x: Array, sigma: Array | float) -> Array:
+            if held is None:
+                return x
+            latents, covered = held
+            there = covered & (sigma >= self.rendered_until)
+            return jnp.where(there, latents + sigma * noise, x).astype(x.dtype)
 
         def slope(x: Array, sigma: Array | float) -> Array:
             x0 = denoise(x, jnp.full((x.shape[0],), sigma), jnp.float32(self.guidance))
@@ -132,13 +168,13 @@ class EDMConfig(Noise):
             first = slope(x, now)
             moved = x + (then - now) * first
             if self.sampler == "heun":
-                moved = x + (then - now) * (first + slope(moved, then)) / 2
-            return moved.astype(x.dtype), None
+                moved = x + (then - now) * (first + slope(kept(moved, then), then)) / 2
+            return kept(moved.astype(x.dtype), then), None
 
         deviation = sigmas[0]
         if self.target == "v":
             deviation = np.sqrt(deviation**2 + np.float32(self.sigma_data) ** 2)
-        start = (noise * deviation).astype(noise.dtype)
+        start = kept((noise * deviation).astype(noise.dtype), sigmas[0])
         x, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas[:-1]), jnp.asarray(sigmas[1:])))
         if self.ends == "sigma_min":
             return x

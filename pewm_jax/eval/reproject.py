@@ -23,8 +23,6 @@ from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.errors import require
 from pewm_jax.eval.metrics.images import MASKS, error_sums_batch, unit_colours
 from pewm_jax.eval.statistics import scores
-from pewm_jax.geometry.cameras import unproject
-from pewm_jax.geometry.depth_images import normals
 from pewm_jax.io.store import ResultCache, file_hash, inputs_hash
 from pewm_jax.memory import rendering
 from pewm_jax.types import Array, Camera, Clip, Frames, View
@@ -89,18 +87,17 @@ def reproject(settings: ReprojectSettings, context: Frames, camera: Camera) -> F
 
 def draw(settings: ReprojectSettings, context: Frames, camera: Camera) -> View:
     """Return the rendering before holes are filled, colours in [0, 1]."""
-    depth_SHW = jnp.asarray(context.depth_THW)
-    height, width = depth_SHW.shape[1:]
-    points = unproject(depth_SHW, context.camera).reshape(-1, 3)
-    colours = unit_colours(context.rgb_THWC).reshape(-1, 3)
-    there = (depth_SHW > 0).reshape(-1)
-    if settings.average or settings.footprint > 1 or not settings.backs:
-        focal = jnp.asarray(context.camera.intrinsics_4)[:, 0, None, None]
-        sizes = settings.width * (depth_SHW / focal).reshape(-1)
-        facing = None if settings.backs else normals(depth_SHW, context.camera).reshape(-1, 3)
-        how = {"most": settings.footprint, "average": settings.average, "normals_V3": facing}
-        return rendering.splat_surfels(points, colours, sizes, there, camera, height, width, **how)
-    return rendering.splat(points, colours, there, camera, height, width)
+    height, width = context.depth_THW.shape[1:]
+    return rendering.splat_frames(
+        dataclasses.replace(context, rgb_THWC=unit_colours(context.rgb_THWC)),
+        camera,
+        height,
+        width,
+        most=settings.footprint,
+        pixels=settings.width,
+        average=settings.average,
+        backs=settings.backs,
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)

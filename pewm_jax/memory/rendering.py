@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.geometry import depth_images, zbuffer
-from pewm_jax.geometry.cameras import project
+from pewm_jax.geometry.cameras import project, unproject
 from pewm_jax.geometry.zbuffer import NEAREST_M, ProjectedPoints
-from pewm_jax.types import Array, Camera, View
+from pewm_jax.types import Array, Camera, Frames, View
 
 TOLERANCE_M, TOLERANCE_RELATIVE = 0.05, 0.1
 """Points on one surface lie within the larger of 5 cm and 10 % behind its front (a floor seen at a
@@ -139,6 +139,48 @@ def splat_surfels(
 
     # Frame after frame: the data of one fit a processor's cache, those of nine do not.
     return _as_images(jax.lax.map(one, jax.tree.map(jnp.asarray, camera)), height, width)
+
+
+def splat_frames(
+    frames: Frames,
+    camera: Camera,
+    height: int,
+    width: int,
+    *,
+    most: int = 3,
+    pixels: float = 1.0,
+    average: bool = True,
+    backs: bool = False,
+) -> View:
+    """Render the pixels of S frames for other cameras: every pixel with depth becomes a point.
+
+    Args:
+        frames: (S, H, W, C) floats as colours, and (S, H, W) depth, metres; pixels with a depth of
+            0 are ignored.
+        camera: (T,) cameras of images of ``height`` × ``width`` pixels.
+        height: see ``camera``.
+        width: see ``camera``.
+        most: largest size of a point, pixels in each direction; see ``splat_surfels``.
+        pixels: width of a point, in pixels of the frame that observed it.
+        average: blend the points at the front; otherwise show the nearest. Points of one pixel that
+            are neither blended nor hidden by their side are drawn by ``splat``.
+        backs: show surfaces from behind too; otherwise a back face hides what lies behind it.
+
+    Returns:
+        Views with the frames' colours as features; holes are not filled.
+    """
+    depth_SHW = jnp.asarray(frames.depth_THW)
+    points = unproject(depth_SHW, frames.camera).reshape(-1, 3)
+    colours = jnp.asarray(frames.rgb_THWC)
+    colours = colours.reshape(-1, colours.shape[-1])
+    there = (depth_SHW > 0).reshape(-1)
+    if backs and most == 1 and not average:
+        return splat(points, colours, there, camera, height, width)
+    focal = jnp.asarray(frames.camera.intrinsics_4)[:, 0, None, None]
+    sizes = pixels * (depth_SHW / focal).reshape(-1)
+    facing = None if backs else depth_images.normals(depth_SHW, frames.camera).reshape(-1, 3)
+    how = {"most": most, "average": average, "normals_V3": facing}
+    return splat_surfels(points, colours, sizes, there, camera, height, width, **how)
 
 
 def splat_cells(

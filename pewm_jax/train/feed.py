@@ -228,8 +228,12 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
         for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
             model.pop(part, None)
     reader = model.get("memory", {}).get("reader", {})
-    if reader.get("picture") == "pixels":  # implied in earlier versions
-        del reader["picture"]
+    # The only values of earlier versions, whose prepared clips are still used.
+    earlier = (reader, "picture", "pixels"), (model, "observed", "first")
+    earlier = (*earlier, (model.get("noise", {}), "rendered_until", 0.0))
+    for section, setting, value in earlier:
+        if section.get(setting) == value:
+            del section[setting]
     data = configuration.to_dict(config.data)
     split = read_manifest(Path(config.data.path) / "train")
     for setting in ("path", "features", "prepared", "prepared_path", "workers", "bad_records"):

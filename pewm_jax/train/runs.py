@@ -52,6 +52,7 @@ MUTABLE_FIELDS = (
     "model.noise.sigma_max",
     "model.noise.rho",
     "model.noise.ends",
+    "model.noise.rendered_until",
     "train.run",
     "train.save_every",
     "train.keep",

@@ -28,13 +28,8 @@ from pewm_jax.config.parts import Noise
 from pewm_jax.memory import interface as memories
 from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MemoryReadout, Params, View
-from pewm_jax.worlds import world_model
+from pewm_jax.worlds import perturbation, world_model
 from pewm_jax.worlds.control import require_actions
-
-BROAD = 8
-"""Pixels, along each axis, per cell of the broad noise on depth."""
-FINE = 0.3
-"""The noise on depth of each pixel, as a share of the broad noise."""
 
 
 def clip_readout(
@@ -78,17 +73,25 @@ def _features(model: AssembledModel, weights: Params, rgb_BSHWC: Array) -> Array
     return jax.lax.map(of_clip, rgb_BSHWC) if large else jax.vmap(of_clip)(rgb_BSHWC)
 
 
-def prepare(model: AssembledModel, params: Params, clip: Clip, *, memory: bool) -> Clip:
+def prepare(
+    model: AssembledModel, params: Params, clip: Clip, *, memory: bool, history: int = 1
+) -> Clip:
     """Encode a batch's frames and, with ``memory``, read out its memories; the context is dropped.
 
     Returns:
-        The batch with the extras ``latents_thwC`` and, with a memory, ``readout``.
+        The batch with the extras ``latents_thwC``, with a memory ``readout``, and with
+        ``model.observed`` `warped` ``everywhere_thwC``, made from the first ``history`` frames.
     """
     frames = as_signal(clip.frames)
+    warped = None
+    if model.observed == "warped":
+        observed = jax.tree.map(lambda x: x[:, :history], frames)
+        warped = world_model.everywhere(model, params, observed, frames.camera)
     return clip.without_context().with_extras(
         context_features_ShwF=None,
         latents_thwC=rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
         readout=clip_readout(model, params, clip) if memory else None,
+        everywhere_thwC=warped,
     )
 
 
@@ -105,7 +108,8 @@ def loss(
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of one batch and its parts.
 
-    ``train`` has the settings of noise on the observed frame, chained clips and hidden memories.
+    ``train`` has the settings of noise on the observed frame, chained clips, hidden memories and
+    errors in them. Warped latents of the observed frame get noise of the same size as its colours.
     The first ``history`` frames of a clip are observed; a share ``blind`` of the clips lacks the
     input of guidance; ``memory`` is True in stage 2.
 
@@ -119,40 +123,19 @@ def loss(
     x0 = clip.extras.get("latents_thwC")
     if x0 is None:
         x0 = rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW)
-    batch = x0.shape[0]
     time_key, noise_key, level_key, image_key = jax.random.split(key, 4)
-    times = model.noise.draw(time_key, batch, x0.shape[1])
+    times = model.noise.draw(time_key, x0.shape[0], x0.shape[1])
     noise = jax.random.normal(noise_key, x0.shape)
     x_t = model.noise.corrupt(x0, noise, times)
-
-    level = jnp.exp(
-        train.image_noise_mean
-        + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1, 1))
+    readout = _readout(model, train, params, clip, key) if memory else None
+    observed, more = _observed(
+        model, train, params, clip, x0, readout, (key, level_key, image_key), history
     )
-    readout = clip.extras.get("readout") if memory else None
-    if memory and readout is None:
-        readout = clip_readout(model, params, clip)
-    if readout is not None and train.hidden:
-        kept = jax.random.bernoulli(jax.random.fold_in(key, 4), 1 - train.hidden, (batch,))
-        readout = hide_readout(readout, kept)
-    first, depth = frames.rgb_THWC[:, :history], frames.depth_THW[:, :history]
-    if train.chained:
-        again = jax.random.fold_in(key, 5)
-        first, depth = first_frames(model, train.chained, params, frames, x0, readout, again)
-    clean = first
-    first = first + level * jax.random.normal(image_key, first.shape)
-    if train.depth_noise:
-        depth = depth * depth_noise(
-            jax.random.fold_in(image_key, 1), depth.shape, train.depth_noise
-        )
-    observed = Frames(first, depth, jax.tree.map(lambda x: x[:, :history], frames.camera))
     require_actions(model, clip.actions_TA, "the loss")
     control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
-    conditioning = world_model.condition(
-        model, params, observed, control, noise_B=level.reshape(batch), clean_BTHWC=clean
-    )
+    conditioning = world_model.condition(model, params, observed, control, **more)
     if blind:
-        hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (batch,))
+        hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (len(x0),))
         conditioning = world_model.blind(model, params, conditioning, hidden)
     inputs, network_time = model.noise.precondition(x_t, times)
     prediction = world_model.apply(model, params, inputs, conditioning, network_time, readout)
@@ -174,6 +157,86 @@ def loss(
     return total, {"loss_rgb": rgb, "loss_depth": depth}
 
 
+def _readout(
+    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> MemoryReadout:
+    """Return what the memories of a batch show in training: some hidden, some with errors."""
+    readout = clip.extras.get("readout")
+    if readout is None:
+        readout = clip_readout(model, params, clip)
+    if train.hidden:
+        batch = len(clip.frames.depth_THW)
+        kept = jax.random.bernoulli(jax.random.fold_in(key, 4), 1 - train.hidden, (batch,))
+        readout = hide_readout(readout, kept)
+    if train.memory_errors:
+        own = jax.random.fold_in(key, 7)
+        readout = perturbation.plant_errors(
+            model, train.memory_errors, readout, clip.frames.camera, own
+        )
+    return readout
+
+
+def _observed(
+    model: AssembledModel,
+    train: TrainSettings,
+    params: Params,
+    clip: Clip,
+    latents_BthwC: Array,
+    readout: MemoryReadout | None,
+    keys: tuple[Array, Array, Array],
+    history: int,
+) -> tuple[Frames, dict[str, Any]]:
+    """Return the observed frames of a batch with noise, some of them predicted by the model.
+
+    Returns:
+        The frames, and the further arguments of ``world_model.condition`` that describe them.
+    """
+    key, level_key, image_key = keys
+    frames, batch = as_signal(clip.frames), len(latents_BthwC)
+    level = jnp.exp(
+        train.image_noise_mean
+        + train.image_noise_std * jax.random.normal(level_key, (batch, 1, 1, 1, 1))
+    )
+    observed = jax.tree.map(lambda x: x[:, :history], frames)
+    first, depth = observed.rgb_THWC, observed.depth_THW
+    if train.chained:
+        again = jax.random.fold_in(key, 5)
+        first, depth = first_frames(
+            model, train.chained, params, frames, latents_BthwC, readout, again
+        )
+    more = {"noise_B": level.reshape(batch), "clean_BTHWC": first}
+    if model.observed == "warped":
+        rows = math.ceil(train.chained * batch)
+        warped = _warped(model, params, clip, Frames(first, depth, observed.camera), rows)
+        more["everywhere_BthwC"] = _noisy(warped, level, jax.random.fold_in(image_key, 2))
+    first = first + level * jax.random.normal(image_key, first.shape)
+    if train.depth_noise:
+        errors_key = jax.random.fold_in(image_key, 1)
+        depth = depth * perturbation.depth_noise(errors_key, depth.shape, train.depth_noise)
+    return Frames(first, depth, observed.camera), more
+
+
+def _warped(
+    model: AssembledModel, params: Params, clip: Clip, observed: Frames, rows: int
+) -> Array:
+    """Return ``world_model.everywhere`` of a batch; if prepared, only its leading rows are made."""
+    prepared = clip.extras.get("everywhere_thwC")
+    inputs = observed, clip.frames.camera
+    if prepared is not None:
+        inputs = jax.tree.map(lambda x: x[:rows], inputs)
+        if not rows:
+            return prepared
+    made = world_model.everywhere(model, params, *inputs)
+    return made if prepared is None else jnp.concatenate([made, prepared[rows:]])
+
+
+def _noisy(warped_BthwC: Array, level: Array, key: Array) -> Array:
+    """Add noise to warped latents as deep as that on the observed colours; not to holes or mask."""
+    latents, mask = warped_BthwC[..., :-1], warped_BthwC[..., -1:]
+    noise = level * jax.random.normal(key, latents.shape)
+    return jnp.concatenate([jnp.where(mask > 0, latents + noise, latents), mask], -1)
+
+
 def hide_readout(readout: MemoryReadout, kept_B: Array) -> MemoryReadout:
     """Mask the memory's readout for the clips of a batch that are not in ``kept_B``."""
 
@@ -186,20 +249,6 @@ def hide_readout(readout: MemoryReadout, kept_B: Array) -> MemoryReadout:
 
     names = {"tokens": "valid_M", "view": "seen_THW", "encoded": "seen_THW"}
     return MemoryReadout(**{part: masked(getattr(readout, part), m) for part, m in names.items()})
-
-
-def depth_noise(key: Array, shape: tuple[int, ...], most: float) -> Array:
-    """Draw multiplicative errors of depth (B, T, H, W): smooth over the image, and small per pixel.
-
-    Each clip draws its size from 0 to ``most``, a share of the depth.
-    """
-    size_key, broad_key, fine_key = jax.random.split(key, 3)
-    batch, frames, height, width = shape
-    size = most * jax.random.uniform(size_key, (batch, 1, 1, 1))
-    cells = (batch, frames, -(-height // BROAD), -(-width // BROAD))
-    broad = jax.image.resize(jax.random.normal(broad_key, cells), shape, "bilinear")
-    fine = jax.random.normal(fine_key, shape)
-    return jnp.exp(size * (broad + FINE * fine))
 
 
 without_memory = functools.partial(loss, memory=False)

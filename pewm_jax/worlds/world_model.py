@@ -1,8 +1,9 @@
 """The world model's network: the denoiser, conditioned on frame, control, text and memory.
 
 Input channels, in order: noisy colour and depth latents; the observed frames in the backbone's form
-(by default their latents, zero for later frames); the channels of the control (Plücker rays). At
-the injection points of the backbone, a reader reads the memory.
+(by default their latents, zero for later frames); with ``model.observed`` `every` or `warped` the
+observed frame at every latent frame (``everywhere``); the channels of the control (Plücker rays).
+At the injection points of the backbone, a reader reads the memory.
 
 Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
 frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (the backbone's image encoder) and
@@ -13,17 +14,26 @@ frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (the backbone's imag
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.codecs import rgbd
+from pewm_jax.codecs.pixel import fold
 from pewm_jax.config import AssembledModel
 from pewm_jax.controls import camera as camera_control
+from pewm_jax.memory import interface as memories
+from pewm_jax.memory import rendering
 from pewm_jax.models import interface as backbones
 from pewm_jax.models.interface import NO_READERS, Conditioning, Observed
-from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params
+from pewm_jax.nn import placement
+from pewm_jax.types import Array, Camera, Control, EncodedView, Frames, MemoryReadout, Params, View
+
+COVERED = 0.75
+"""Share of a latent cell's pixels that the memory shows where sampling takes it as rendered
+(``noise.rendered_until``)."""
 
 
 @jax.tree_util.register_dataclass
@@ -50,13 +60,15 @@ def condition(
     *,
     noise_B: Array | None = None,
     clean_BTHWC: Array | None = None,
+    everywhere_BthwC: Array | None = None,
 ) -> ClipConditioning:
     """Build the conditioning of a batch of clips.
 
     Observed are the (B, 1) first frames, colours in [−1, 1], depth in metres, or as many as fill
     latent frames; the control has (B, T) cameras, and (B, T − 1) actions if there are any.
     ``noise_B`` is the deviation of noise that was added to the observed colours, and
-    ``clean_BTHWC`` are the colours before.
+    ``clean_BTHWC`` are the colours before. ``everywhere_BthwC`` is the result of ``everywhere``, if
+    it is known.
     """
     batch, rgb = len(observed.depth_THW), observed.rgb_THWC
     first = rgbd.encode_rgbd(model, params, rgb, observed.depth_THW, condition=True)
@@ -67,7 +79,10 @@ def condition(
     )
     shown = backbones.observed(model, params, seen)
     steering = model.control.condition(model, params.get("control", {}), observed, control)
-    joined = [x for x in (shown.joined_BthwC, steering.joined_BthwC) if x is not None]
+    if everywhere_BthwC is None:
+        everywhere_BthwC = everywhere(model, params, observed, control.camera, first)
+    parts = (shown.joined_BthwC, everywhere_BthwC, steering.joined_BthwC)
+    joined = [x for x in parts if x is not None]
     given = dataclasses.replace(
         shown,
         joined_BthwC=jnp.concatenate(joined, -1),
@@ -75,6 +90,74 @@ def condition(
         tokens_BLC=_text(model, params, batch, steering.tokens_BLC),
     )
     return ClipConditioning(given, control.camera, camera_control.rays(model, control.camera))
+
+
+def everywhere(
+    model: AssembledModel,
+    params: Params,
+    observed: Frames,
+    camera: Camera,
+    latents_BthwC: Array | None = None,
+) -> Array | None:
+    """Return the observed frame at every latent frame: its latents, and a mask as last channel.
+
+    With ``model.observed`` `every` these are the last observed frame's latents, and the mask is 1.
+    With `warped` the observed frames are rendered from the clip's cameras by their depth
+    (``rendering.splat_frames``) and encoded, holes filled from the nearest pixel. The mask is the
+    share of a cell's pixels that were rendered; latents are 0 where it is 0.
+
+    Args:
+        model: the model.
+        params: the world model's parameters; the codec's are used.
+        observed: (B, S) the observed frames, colours in [−1, 1], depth in metres.
+        camera: (B, T) the clip's cameras.
+        latents_BthwC: the observed frames' latents, encoded as a condition, if they are known.
+
+    Returns:
+        (B, t, h, w, C + 1); None with `first`.
+    """
+    if model.observed == "first":
+        return None
+    if model.observed == "warped":
+        latents, mask = _warped(model, params, observed, camera)
+    else:
+        if latents_BthwC is None:
+            latents_BthwC = rgbd.encode_rgbd(
+                model, params, observed.rgb_THWC, observed.depth_THW, condition=True
+            )
+        last = latents_BthwC[:, -1:]
+        latents = jnp.broadcast_to(last, (len(last), *model.latent_shape, last.shape[-1]))
+        mask = jnp.ones((*latents.shape[:-1], 1))
+    return jnp.concatenate([_seen(model, latents), mask], -1)
+
+
+def _warped(
+    model: AssembledModel, params: Params, observed: Frames, camera: Camera
+) -> tuple[Array, Array]:
+    """Return the latents of observed frames seen from other cameras, and the share of each cell."""
+
+    def of_batch(weights: Params, observed: Frames, camera: Camera) -> EncodedView:
+        def of_clip(clip: tuple[Frames, Camera]) -> EncodedView:
+            view = rendering.splat_frames(*clip, model.clip.height, model.clip.width)
+            return memories.encode(model, weights, view)
+
+        return jax.lax.map(of_clip, (observed, camera))
+
+    inputs = jax.tree.map(jnp.asarray, (observed, camera))
+    encoded = placement.by_batch(of_batch, _codec(params), *inputs)
+    share = _share(model, encoded)
+    return jnp.where(share > 0, encoded.latents_thwC, 0), share
+
+
+def _codec(params: Params) -> Params:
+    """Return the codec's parameters among the world model's."""
+    return {name: params[name] for name in ("codec",) if name in params}
+
+
+def _share(model: AssembledModel, encoded: EncodedView) -> Array:
+    """Return (B, t, h, w, 1) the share of each latent cell's pixels that a view shows."""
+    seen = encoded.seen_THW[..., None].astype(jnp.float32)
+    return fold(seen, model.codec.spatial, model.codec.temporal).mean(-1, keepdims=True)
 
 
 def blind(
@@ -109,7 +192,7 @@ def without_image(
         return jnp.where(there & (np.arange(x.shape[-1]) < channels), 0, x)
 
     joined, image, known = given.joined_BthwC, given.image_BMD, given.known_Bt
-    shown = model.backbone.shown_channels(model)
+    shown = model.backbone.shown_channels(model) + model.everywhere_channels
     hidden = dataclasses.replace(
         given,
         joined_BthwC=None if joined is None else hide(joined, shown),
@@ -215,7 +298,8 @@ def sample(
     g vary with the step (``noise.dynamic_guidance``). ``blind`` is the conditioning without the
     input that guidance strengthens, and replaces "no map". Where the conditioning knows latents, x0
     is the known value. Sampling starts from standard normal noise; ``key`` is for samplers that
-    draw more.
+    draw more. With ``noise.rendered_until``, the latents that the rendered memory covers are those
+    of the rendering with noise, down to that level.
 
     Raises:
         ValueError: the sampler draws noise at every step and there is no key.
@@ -234,4 +318,27 @@ def sample(
             clean = without + weight * (clean - without)
         return backbones.held(conditioning.backbone, clean)
 
-    return noise.sample(denoise, noise_BthwC, key)
+    more: dict[str, Any] = {}
+    if noise.rendered_until and readout is not None:
+        more = {"held": rendered_latents(model, params, readout)}
+    return noise.sample(denoise, noise_BthwC, key, **more)
+
+
+def rendered_latents(
+    model: AssembledModel, params: Params, readout: MemoryReadout
+) -> tuple[Array, Array]:
+    """Return the latents of a batch's rendered memory, and the cells that it covers.
+
+    Returns:
+        ``(latents_BthwC, covered_Bthw1)``; a cell is covered if the memory shows at least the share
+        ``COVERED`` of its pixels; holes have the colour and depth of the nearest pixel.
+    """
+    encoded = readout.encoded
+    if encoded is None:
+
+        def of_batch(weights: Params, view: View) -> EncodedView:
+            return jax.lax.map(lambda one: memories.encode(model, weights, one), view)
+
+        encoded = placement.by_batch(of_batch, _codec(params), readout.view)
+    covered = _share(model, encoded) >= COVERED
+    return _seen(model, encoded.latents_thwC), covered

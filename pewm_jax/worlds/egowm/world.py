@@ -28,6 +28,7 @@ from pewm_jax.config import (
     TrainSettings,
     register,
 )
+from pewm_jax.config.assembled import WhereObserved
 from pewm_jax.errors import require
 from pewm_jax.registry import part
 from pewm_jax.types import Array, Clip, Control, Frames, Params, WorldState
@@ -42,6 +43,7 @@ class EgoWMTrainConfig(TrainSettings):
 
     ZERO: ClassVar[dict[str, str]] = {
         "hidden": "this world has no memory to hide",
+        "memory_errors": "this world has no memory",
         "chained": "the clips of this world cannot be run backwards",
     }
 
@@ -80,6 +82,11 @@ class EgoWM(AssembledModel):
     """Frames at the beginning of every clip that are observed, or were imagined before: 1 in Stable
     Video Diffusion and CogVideoX; more if the backbone is trained with more. They fill latent
     frames: with `codec.temporal` 4, use 4k + 1."""
+    observed: WhereObserved = "first"
+    """Where the observed frames condition a chunk. `first`: at their latent frames. `every`: the
+    last one's latents at every latent frame. `warped`: their colour and depth, rendered from each
+    frame's camera and encoded; holes are marked by a mask; it needs `clip.depth`. The last two add
+    input channels to the backbone."""
     image_noise: float = 0.0
     """Deviation of the noise on these frames in rollouts; the paper's is 0.1, with Stable Video
     Diffusion. The settings of `train` determine it in training."""
@@ -133,7 +140,7 @@ class EgoWM(AssembledModel):
 
     def prepare(self, params: Params, clip: Clip) -> Clip:
         """Encode a batch's frames; see ``objective.prepare``."""
-        return objective.prepare(self, params, clip, memory=False)
+        return objective.prepare(self, params, clip, memory=False, history=self.history)
 
     def stages(self) -> tuple[Stage, ...]:
         """Return the two stages.

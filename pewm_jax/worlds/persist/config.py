@@ -31,7 +31,7 @@ class PersistTrainConfig(TrainSettings):
     """Training of the networks, one after the other; the codec of images is frozen."""
 
     ZERO: ClassVar[dict[str, str]] = dict.fromkeys(
-        ("hidden", "chained"), "it is for worlds with memory blocks"
+        ("hidden", "memory_errors", "chained"), "it is for worlds with memory blocks"
     )
 
     run: str = "runs/persist"

@@ -21,10 +21,11 @@ import jax.numpy as jnp
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, rgbd_signal
 from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError, register
+from pewm_jax.config.assembled import WhereObserved
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params, View, WorldState
-from pewm_jax.worlds import checks, objective, world_model
+from pewm_jax.worlds import checks, objective, perturbation, world_model
 from pewm_jax.worlds import codec as codec_task
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.pewm import candidates
@@ -69,12 +70,19 @@ def prepare_gate(model: AssembledModel, params: Params, clip: Clip) -> Clip:
 def gate_loss(
     model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of the gate on imagined frames; see ``codec_task.score``."""
+    """Return the loss of the gate on imagined frames; see ``codec_task.score``.
+
+    With ``train.memory_errors`` the gate also gets renderings with errors. The frames were imagined
+    without these, so the gate can learn to prefer them there.
+    """
     assert isinstance(train, TrainConfig)
-    del key
     if "latents_thwC" not in clip.extras:
         clip = jax.lax.stop_gradient(prepare_gate(model, params, clip))
-    view = clip.extras["readout"].view
+    readout = clip.extras["readout"]
+    if train.memory_errors:
+        camera = clip.frames.camera
+        readout = perturbation.plant_errors(model, train.memory_errors, readout, camera, key)
+    view = readout.view
     assert view is not None
     rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
     shown = rgbd_signal(model.clip, view.features_THWF[..., :3], view.depth_THW)
@@ -152,6 +160,11 @@ class PEWM(memories.MemoryEdits, AssembledModel):
     """A video diffusion model with a memory (PEWM)."""
 
     TRAIN: ClassVar[type[TrainSettings]] = TrainConfig
+
+    observed: WhereObserved = "first"
+    """Where the observed frame conditions a clip. `first`: at its own latent frame. `every`: its
+    latents at every latent frame. `warped`: its colour and depth, rendered from each frame's camera
+    and encoded; holes are marked by a mask. The last two add input channels to the backbone."""
 
     def init(self, key: Array) -> Params:
         """Return random parameters of all parts."""
