@@ -24,8 +24,7 @@ from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserErro
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params, View, WorldState
-from pewm_jax.worlds import checks, objective, world_model
-from pewm_jax.worlds import codec as codec_task
+from pewm_jax.worlds import checks, codec_losses, objective, world_model
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.pewm import candidates
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
@@ -69,7 +68,7 @@ def prepare_gate(model: AssembledModel, params: Params, clip: Clip) -> Clip:
 def gate_loss(
     model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of the gate on imagined frames; see ``codec_task.score``."""
+    """Return the loss of the gate on imagined frames; see ``codec_losses.score``."""
     assert isinstance(train, TrainConfig)
     del key
     if "latents_thwC" not in clip.extras:
@@ -79,7 +78,7 @@ def gate_loss(
     rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
     shown = rgbd_signal(model.clip, view.features_THWF[..., :3], view.depth_THW)
     truth = jax.tree.map(lambda x: x[:, 1:], as_signal(clip.frames))
-    return codec_task.score(
+    return codec_losses.score(
         model,
         params["codec"]["gate"],
         rgb[:, 1:],
@@ -92,11 +91,11 @@ def gate_loss(
 
 
 def gate_perceptual(model: AssembledModel, train: TrainSettings) -> Params | None:
-    """Return the weights that ``gate_loss`` needs, or None; see ``codec_task.lpips_weights``."""
+    """Return the weights that ``gate_loss`` needs, or None; see ``codec_losses.lpips_weights``."""
     assert isinstance(train, TrainConfig)
     if not train.gate_lpips:
         return None
-    return codec_task.lpips_weights(codec_task.LPIPS, model.clip)
+    return codec_losses.lpips_weights(codec_losses.LPIPS, model.clip)
 
 
 FROZEN = r"(codec|encoder|image|text)/.*"
