@@ -16,6 +16,7 @@ from pewm_jax.config import ClipConfig
 from pewm_jax.models.lpips import convert as lpips_convert
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.types import Array, Frames, Params
+from pewm_jax.worlds import sharpen
 
 SMALL = 1e-4
 """Added to variances."""
@@ -123,11 +124,7 @@ def score(
         frames, and where anything was rendered also of the rendering; ``depth_m``, the mean
         absolute error of the gate's depth.
     """
-    decoded = rgbd_signal(model.clip, rgb_BTHWC, depth_BTHW)
-    wanted = rgbd_signal(model.clip, truth.rgb_THWC, truth.depth_THW)
-    shape = (-1, *wanted.shape[-3:])
-    decoded, shown, wanted = (x.reshape(shape) for x in (decoded, shown_BTHWC, wanted))
-    decoded = jax.lax.stop_gradient(decoded)
+    decoded, shown, wanted = _signals(model, rgb_BTHWC, depth_BTHW, shown_BTHWC, truth)
     seen = seen_BTHW.reshape(-1, *wanted.shape[1:3])
     made = gates.apply(gate, decoded, shown, seen)
     depth = truth.depth_THW.reshape(seen.shape)
@@ -151,6 +148,64 @@ def score(
         "psnr_rendered": _psnr(shown, wanted, hit),
         "depth_m": (off * measured).sum() / jnp.maximum(measured.sum(), 1),
     }
+
+
+def _signals(
+    model: Any, rgb_BTHWC: Array, depth_BTHW: Array, shown_BTHWC: Array, truth: Frames
+) -> tuple[Array, Array, Array]:
+    """Return decoded, rendered and true frames (N, H, W, 4): colour and depth signal."""
+    decoded = rgbd_signal(model.clip, rgb_BTHWC, depth_BTHW)
+    wanted = rgbd_signal(model.clip, truth.rgb_THWC, truth.depth_THW)
+    shape = (-1, *wanted.shape[-3:])
+    decoded, shown, wanted = (x.reshape(shape) for x in (decoded, shown_BTHWC, wanted))
+    return jax.lax.stop_gradient(decoded), shown, wanted
+
+
+def sharpen_gate(
+    model: Any,
+    train: Any,
+    params: Params,
+    rgb_BTHWC: Array,
+    depth_BTHW: Array,
+    shown_BTHWC: Array,
+    seen_BTHW: Array,
+    truth: Frames,
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss that sharpens a gate: ``sharpen.loss`` of colour, absolute error of depth.
+
+    Arguments are those of ``score``; ``train`` has the weights, and ``params`` the gate, the
+    discriminator and, if it counts, LPIPS.
+
+    Returns:
+        ``(loss, measured)``: those of ``sharpen.loss``; ``loss_depth``, and ``psnr_rgb`` of the
+        gate's result.
+    """
+    gate = params["codec"]["gate"]
+    decoded, shown, wanted = _signals(model, rgb_BTHWC, depth_BTHW, shown_BTHWC, truth)
+    seen = seen_BTHW.reshape(-1, *wanted.shape[1:3])
+
+    def mix(gate: Params) -> Array:
+        return gates.apply(gate, decoded, shown, seen)
+
+    def perceived(made_NHWC: Array) -> Array:
+        return lpips.apply(LPIPS, params["lpips"], made_NHWC, wanted[..., :3]).mean()
+
+    made = mix(gate)
+    measured = (truth.depth_THW.reshape(seen.shape) > 0).astype(made.dtype)
+    off = jnp.abs(made[..., 3] - wanted[..., 3]) * measured
+    off = off.sum() / jnp.maximum(measured.sum(), 1)
+    loss, found = sharpen.loss(
+        made[..., :3],
+        wanted[..., :3],
+        params[sharpen.NAME],
+        pull=sharpen.pull_of_last(lambda gate: mix(gate)[..., :3], gate),
+        lpips=perceived if train.sharpen_lpips else None,
+        lpips_weight=train.sharpen_lpips,
+        gan_weight=train.gan_weight,
+    )
+    everywhere = jnp.ones_like(measured)[..., None]
+    quality = {"loss_depth": off, "psnr_rgb": _psnr(made, wanted, everywhere)}
+    return loss + off, found | quality
 
 
 def _psnr(made: Array, truth: Array, where: Array) -> Array:
