@@ -107,11 +107,11 @@ def _score_codec(settings: EvaluateSettings) -> None:
     from pewm_jax.eval import codec_score
 
     unsupported = _given({**settings.changes(), "out": settings.out})
-    chosen = {name: unsupported.pop(name, None) for name in ("data", "split")}
+    chosen = {name: unsupported.pop(name, None) for name in ("data", "split", "lpips", "fvd")}
     if unsupported:
         raise ConfigError(
             f"{settings.run} contains a codec, which is evaluated on the frames of --data and "
-            f"--split: omit {', '.join('--' + name for name in unsupported)}."
+            f"--split, by --lpips and --fvd: omit {', '.join('--' + name for name in unsupported)}."
         )
     print(f"numbers: {codec_score.score(settings.run, **chosen)}")
 

@@ -233,6 +233,14 @@ class TrainConfig(TrainSettings):
     gate_lpips: float = 0.0
     """Weight of LPIPS (AlexNet's, `pip install 'pewm-jax[metrics]'`) in the loss of stage `gate`; 0
     leaves it out."""
+    sharpen: StageConfig = StageConfig(steps=0, batch=4, learning_rate=3e-4)
+    """The codec's gate is trained further on imagined clips, with LPIPS and a discriminator, to mix
+    sharp frames (not in the paper); skipped by default."""
+    sharpen_lpips: float = 1.0
+    """Weight of LPIPS in stage `sharpen`, relative to the absolute error; 0 leaves it out."""
+    gan_weight: float = 0.5
+    """Weight of the discriminator in stage `sharpen`: its gradient in the gate's last layer, as a
+    share of that of the absolute error and LPIPS; 0 leaves it out."""
 
     def __post_init__(self):
         """Validate."""
@@ -243,7 +251,19 @@ class TrainConfig(TrainSettings):
             "freezes the backbone, whose output starts at zero, so nothing would be learned; set "
             "train.stage1.steps at least 1, or name trained weights by train.start.",
         )
-        require(self.gate_lpips >= 0, f"train.gate_lpips is {self.gate_lpips}: use 0 or more.")
+        weights = ("gate_lpips", "sharpen_lpips", "gan_weight")
+        require_fields(self, "train", lambda value: value >= 0, "0 or more", *weights)
+
+    def require_fit(self, model: Any) -> None:
+        """Refuse to sharpen the gate of a model that has none."""
+        super().require_fit(model)
+        if self.sharpen.steps:
+            require(
+                any(stage.name == "sharpen" for stage in model.stages()),
+                f"train.sharpen.steps is {self.sharpen.steps}, but this model has no gate that "
+                "mixes its memory's colours in: give it a codec with a gate (codec.kind learned, "
+                "codec.gate) and a memory of colours, or set train.sharpen.steps 0.",
+            )
 
 
 @dataclasses.dataclass(frozen=True)

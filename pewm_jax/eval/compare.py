@@ -188,7 +188,9 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
     protocols = [report.metrics["protocol"] for report in reports]
     nets = {each.get("lpips_name") or each["lpips_weights_sha256"] for each in protocols} - {None}
     skip = {"lpips"} if len(nets) > 1 else set()
-    measured = [set(_values(group, "clips", skip)[MASKS[-1]]) for group in (one, two)]
+    clips = [_values(group, "clips", skip) for group in (one, two)]
+    measured = [set(table[MASKS[-1]]) for table in clips]
+    masked = [set(table["seen"]) | set(table["unseen"]) for table in clips]
     content: dict[str, Any] = {
         "schema": SCHEMA,
         "protocol_sha256": one[0].protocol.sha256,
@@ -197,6 +199,8 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
         "lpips_name": one[0].metrics["protocol"].get("lpips_name"),
         "left_out": sorted(skip),
         "measured_by_one": sorted(measured[0] ^ measured[1]),
+        "masked_by_one": sorted(masked[0] ^ masked[1]),
+        "videos": _videos(one, two),
     }
     sides = {"a": one, "b": two}
     for side, group in sides.items():
@@ -213,6 +217,33 @@ def content_of(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any]:
             content["training_seeds"] = _over_seeds(values, houses_C)
             content["by_house"] = _by_house(one[0], averaged, houses_C)
     return content
+
+
+def _videos(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any] | None:
+    """Return FVD and KVD of both models, means over training seeds; None if one has none.
+
+    They are numbers of a whole set of clips, so they are not paired and have no interval. They are
+    compared only if they have equal names: the same network, frames and number of clips.
+    """
+    found = [[report.metrics.get("videos") for report in group] for group in (one, two)]
+    everywhere = [videos for group in found for videos in group]
+    if not all(everywhere) or any(x["names"] != everywhere[0]["names"] for x in everywhere):
+        return None
+
+    def tables(report: Report) -> dict[str, Any]:
+        videos = report.metrics["videos"]
+        masks = {**videos.get("masks", {}), MASKS[-1]: videos["results"]}
+        return {mask: table[report.samples.own] for mask, table in masks.items()}
+
+    sides = [[tables(report) for report in group] for group in (one, two)]
+    shared = [mask for mask in MASKS if all(mask in table for group in sides for table in group)]
+    names = everywhere[0]["names"]
+
+    def mean(group: Sequence[Mapping[str, Any]], mask: str, kind: str) -> float:
+        return float(np.mean([table[mask][kind]["value"] for table in group]))
+
+    values = [{m: {k: mean(group, m, k) for k in names} for m in shared} for group in sides]
+    return {"names": names, "a": values[0], "b": values[1]}
 
 
 def _facts(report: Report) -> dict[str, Any]:

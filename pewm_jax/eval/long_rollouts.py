@@ -88,7 +88,7 @@ def roll_long(
 
     found = map_resumable(
         [(method, first) for first in starts for method in methods.names],
-        lambda key: f"rollouts-{methods.piece(key[0])}-seed{seed}-clip{key[1]:04d}",
+        lambda key: f"rollouts2-{methods.piece(key[0])}-seed{seed}-clip{key[1]:04d}",
         work,
         cache=cache,
         what="long rollouts",

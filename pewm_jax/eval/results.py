@@ -122,21 +122,29 @@ def structure(config: Config, scored: Scored, consistency: Consistency) -> dict[
 
 
 def videos(config: Config, scored: Scored, i3d: VideoDistance) -> dict[str, Any] | None:
-    """Return FVD and KVD of every method with their floors; None for fewer than two clips."""
+    """Return FVD and KVD of every method with their floors; None for fewer than two clips.
+
+    ``masks.MASK`` has those of composites, which show the truth outside a mask.
+    """
     clips, frames = len(scored.choices), len(scored.choices[0].targets_N) + 1
     if clips < 2:
         return None
     kinds_of, truth = i3d.kinds(), scored.features[TRUTH]
+
+    def table(features: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        return {
+            method: {kind: metric.score(found, truth).facts() for kind, metric in kinds_of.items()}
+            for method, found in features.items()
+            if method != TRUTH
+        }
+
     return {
         "frames": frames,
         "clips": clips,
         "seed": config.evaluate.seeds[0],
         "names": {kind: metric.name(frames, clips) for kind, metric in kinds_of.items()},
-        "results": {
-            method: {kind: metric.score(found, truth).facts() for kind, metric in kinds_of.items()}
-            for method, found in scored.features.items()
-            if method != TRUTH
-        },
+        "results": table(scored.features),
+        "masks": {mask: table(found) for mask, found in scored.composites.items()},
     }
 
 

@@ -21,11 +21,13 @@ from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.clips import ClipChoice, choose, load_clip, stack
 from pewm_jax.eval.metrics import LPIPS, VideoDistance
 from pewm_jax.eval.metrics.images import (
+    PARTS,
     error_sums_batch,
     seen_masks_batch,
     unit_colours,
     with_lpips,
 )
+from pewm_jax.eval.metrics.perceptual import Towards
 from pewm_jax.eval.metrics.structure import (
     Consistency,
     average,
@@ -52,6 +54,8 @@ class Scored:
             network.
         features: if video distances are measured, method → (C, 400) features of the clips of the
             first seed (``metrics.videos``), including ``truth``.
+        composites: likewise by mask, ``seen`` and ``unseen``, of clips that show the truth outside
+            the mask; without ``truth``, whose composites are itself.
         structure: if SCS is measured, method → (C, 1 + N): SCS of each clip of the first seed and
             of each imagined frame, NaN where nothing counts; the entry ``truth`` is the ceiling.
     """
@@ -59,6 +63,7 @@ class Scored:
     choices: list[ClipChoice]
     sums: dict[str, np.ndarray]
     features: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    composites: dict[str, dict[str, np.ndarray]] = dataclasses.field(default_factory=dict)
     structure: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
@@ -108,7 +113,7 @@ class Batch:
     seen: Any
     unseen: Any
     real: int
-    described: dict[Any, Callable[[Any], Array]] = dataclasses.field(default_factory=dict)
+    described: dict[Any, Towards] = dataclasses.field(default_factory=dict)
     tracked: tuple[Tracked, ...] = ()
 
     def seeds(self, seed: int) -> np.ndarray:
@@ -131,6 +136,12 @@ class Batch:
         parts = self.context.rgb_THWC[:, -1:], rgb_BTHWC
         return jnp.concatenate([2 * unit_colours(part) - 1 for part in parts], 1)
 
+    def composite(self, rgb_BTHWC: Any, mask: str) -> Array:
+        """Return ``whole`` of clips that show the truth outside a mask of ``PARTS``."""
+        within = {"seen": self.seen, "unseen": self.unseen}[mask][..., None]
+        imagined, truth = (unit_colours(x) for x in (rgb_BTHWC, self.targets.rgb_THWC))
+        return self.whole(2 * jnp.where(within, imagined, truth) - 1)
+
     def structure(self, frames: Frames, measure: Consistency) -> np.ndarray:
         """Return SCS of the clips and of their frames, see ``Scored.structure``."""
         whole = unit_colours(self.whole(frames.rgb_THWC)[: self.real])
@@ -145,7 +156,10 @@ class Batch:
             known = lpips.net, lpips.sha256
             if known not in self.described:
                 self.described[known] = lpips.towards(self.targets.rgb_THWC)
-            sums = with_lpips(sums, np.asarray(self.described[known](frames.rgb_THWC)))
+            to = self.described[known]
+            masks = jnp.stack([self.seen, self.unseen], 2)
+            in_masks = np.asarray(to.in_masks(frames.rgb_THWC, masks))
+            sums = with_lpips(sums, np.asarray(to(frames.rgb_THWC)), in_masks)
         return sums[: self.real]
 
 
@@ -183,12 +197,17 @@ def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
     return Tracked(episode.ids(frames), object_ids(episode.info), visible_T)
 
 
+SUMS_PIECE = "table2"
+"""Start of the names of files of sums; a number for each set of sums that versions stored."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Piece:
     """A unit of work: one batch of clips, one method (or ``truth``), one seed, one measurement.
 
     ``first`` is the index of the batch's first clip; ``measured`` is ``sums`` of the errors,
-    ``features`` for the distances of videos, or ``structure`` for SCS.
+    ``features`` for the distances of videos, a mask of ``PARTS`` for those of composites, or
+    ``structure`` for SCS.
     """
 
     method: str
@@ -206,7 +225,10 @@ class Piece:
     ) -> str:
         """Return the file name, which includes all that the result depends on besides the clips."""
         who = "truth" if self.method == TRUTH else methods.piece(self.method)
-        kind = f"i3d-{i3d.sha256[:16]}" if i3d and self.measured == "features" else "table"
+        kind = SUMS_PIECE
+        if i3d and self.measured in ("features", *PARTS):
+            mask = "" if self.measured == "features" else self.measured
+            kind = "-".join(filter(None, ("i3d", i3d.sha256[:16], mask)))
         if structure and self.measured == "structure":
             kind = "-".join(filter(None, ("scs", structure.encoder, structure.sha256[:16])))
         return f"{kind}-{who}-seed{self.seed}-clip{self.first:04d}"
@@ -235,7 +257,8 @@ def score_table(
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     size, starts = config.evaluate.batch, range(0, len(choices), config.evaluate.batch)
-    extras = [name for name, one in (("features", i3d), ("structure", structure)) if one]
+    extras = ["features", *PARTS] if i3d else []
+    extras += ["structure"] if structure else []
 
     def work(todo: list[Piece]) -> Iterator[tuple[Piece, dict[str, np.ndarray]]]:
         methods.prepare(piece.method for piece in todo)
@@ -279,10 +302,15 @@ def score_table(
     sums = {name: np.stack([joined(name, seed, "sums") for seed in seeds[name]]) for name in seeds}
     firsts = {name: some[0] for name, some in seeds.items()} | {TRUTH: 0}
     more = {
-        measured: {name: joined(name, seed, measured) for name, seed in firsts.items()}
+        measured: {
+            name: joined(name, seed, measured)
+            for name, seed in firsts.items()
+            if name != TRUTH or measured not in PARTS
+        }
         for measured in extras
     }
-    return Scored(choices, sums, **more)
+    composites = {mask: more.pop(mask) for mask in PARTS if mask in more}
+    return Scored(choices, sums, composites=composites, **more)
 
 
 def _pieces(
@@ -296,7 +324,7 @@ def _pieces(
                 pieces.append(Piece(method, seed, first, "sums"))
                 if place == 0:
                     pieces += [Piece(method, seed, first, measured) for measured in extras]
-        pieces += [Piece(TRUTH, 0, first, measured) for measured in extras]
+        pieces += [Piece(TRUTH, 0, first, measured) for measured in extras if measured not in PARTS]
     return pieces
 
 
@@ -314,7 +342,11 @@ def _measure(
         assert structure is not None
         return {"structure": batch.structure(frames, structure)}
     assert i3d is not None
-    return {"features": i3d.features(batch.whole(frames.rgb_THWC))[: batch.real]}
+    if piece.measured in PARTS:
+        clips = batch.composite(frames.rgb_THWC, piece.measured)
+    else:
+        clips = batch.whole(frames.rgb_THWC)
+    return {piece.measured: i3d.features(clips)[: batch.real]}
 
 
 COVERAGE = ("seen", "held", "chosen", "attended", "rendered", "looked_at")

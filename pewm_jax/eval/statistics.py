@@ -28,8 +28,8 @@ from pewm_jax.eval.metrics.images import MASKS, PSNR_CEILING, SUMS
 from pewm_jax.report.labels import own_method
 
 METRICS = ("psnr", "ssim", "depth_mae", "depth_rel")
-"""Units: dB; structural similarity; metres; share of the true depth. Under the mask ``all`` there
-is also ``lpips`` if it was measured."""
+"""Units: dB; structural similarity; metres; share of the true depth. There is also ``lpips`` if it
+was measured."""
 ENDS = 16
 """Number of frames at the start and at the end of a long rollout that are compared to measure
 drift."""
@@ -42,8 +42,8 @@ DRAWS, SEED, LEVEL = 10_000, 0, 0.95
 def scores(sums: np.ndarray) -> dict[str, dict[str, np.ndarray]]:
     """Convert sums (..., 3, 9) of ``error_sums``, possibly summed over frames, to scores.
 
-    ``scores[mask][metric]`` has shape (...), NaN if the mask covers too little; ``lpips`` is only
-    under ``all``, and only if it was measured.
+    ``scores[mask][metric]`` has shape (...), NaN if the mask covers too little; ``lpips`` is there
+    only if it was measured.
     """
     result: dict[str, dict[str, np.ndarray]] = {}
     everything = sums[..., MASKS.index("all"), SUMS.index("colours")]

@@ -33,8 +33,12 @@ INTRODUCTION = (
 COLOURS = {"a": "#1f6feb", "b": "#e8731a", "differences": "#1a9a6c"}
 NAMES = {"a": "a", "b": "b", "differences": "a − b"}
 NOT_COMPARED = (
-    "Only per-clip metrics are compared. FVD and KVD (one number per set), the mirror test and "
-    "SRC, drift, and the growth of the map are in the two reports."
+    "Only per-clip metrics are paired. The mirror test and SRC, drift, and the growth of the map "
+    "are in the two reports."
+)
+NO_VIDEOS = (
+    "FVD and KVD are not compared: a report has none, or the two are of another network, or of "
+    "another number of frames or clips."
 )
 
 
@@ -121,7 +125,7 @@ def comparison_page(content: Mapping[str, Any], pictures: Sequence[np.ndarray]) 
     first, *others = sentences(content)
     title = "\n".join(f"{side}: {content[side]['name']}" for side in ("a", "b"))
     opening = [Text(INTRODUCTION, "quiet"), Text(first, "lead"), Bullets(others)]
-    parts = (_scores, _seeds, _horizon, _houses, _protocol)
+    parts = (_scores, _videos, _seeds, _horizon, _houses, _protocol)
     return render(title, opening, [_stills(pictures), *(part(content) for part in parts)])
 
 
@@ -154,12 +158,41 @@ def _scores(content: Mapping[str, Any]) -> Section:
         for name, why in reasons.items()
         if name in METRIC_NAMES
     )
+    for name in content.get("masked_by_one", []):
+        if name in METRIC_NAMES and name not in reasons:
+            left += (
+                f" {METRIC_NAMES[name][0]} over pixels seen before and never seen is omitted: only "
+                "one of the two reports has it; evaluate the other run again."
+            )
     note = (
         "Means over houses of the means within a house, sampling and training seeds averaged "
         "first; in brackets the 95 % interval of a bootstrap over houses. A difference is clear "
         f"if its interval does not contain 0. {NOT_COMPARED}{left}"
     )
     return Section.of_table("Scores", heads, rows, note)
+
+
+def _videos(content: Mapping[str, Any]) -> Section:
+    """Return FVD and KVD of both models; a sentence if they cannot be compared."""
+    found = content.get("videos")
+    if not found:
+        return Section.of_note(NO_VIDEOS)
+    rows: list[Row] = []
+    for mask in (mask for mask in MASK_NAMES if mask in found["a"]):
+        rows.append(heading_row(MASK_NAMES[mask]))
+        rows += [
+            row(side, *(f"{found[side][mask][kind]:.4g}" for kind in found["names"]))
+            for side in ("a", "b")
+        ]
+        gains = (found["a"][mask][kind] - found["b"][mask][kind] for kind in found["names"])
+        rows.append(row("a − b", *(f"{gain:+.4g}" for gain in gains), highlight=True))
+    note = (
+        "Distances between the set of imagined clips and that of true ones, first sampling seed, "
+        "means over training seeds. They have no interval; their floors are in the two reports. "
+        "Over pixels seen before, or never seen, clips show the truth at all other pixels."
+    )
+    heads = ["", *(f"{name} ↓" for name in found["names"].values())]
+    return Section.of_table("Videos as a whole", heads, rows, note)
 
 
 def _seeds(content: Mapping[str, Any]) -> Section:

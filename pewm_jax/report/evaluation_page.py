@@ -281,9 +281,12 @@ def videos(metrics: Mapping[str, Any]) -> Section:
     if not found:
         return Section.of_note(metrics["protocol"]["fvd"])
     rows = []
-    for method, label in labelled(found["results"]):
-        entries = [found["results"][method][name] for name in found["names"]]
-        rows.append(row(label, *(cell for entry in entries for cell in _distance(entry))))
+    tables = {**found.get("masks", {}), "all": found["results"]}
+    for mask, results in tables.items():
+        rows += [heading_row(MASK_NAMES[mask])] if len(tables) > 1 else []
+        for method, label in labelled(results):
+            entries = [results[method][name] for name in found["names"]]
+            rows.append(row(label, *(cell for entry in entries for cell in _distance(entry))))
     heads = [
         head for name in found["names"].values() for head in (f"{name} ↓", "halves", "their floor")
     ]
@@ -292,7 +295,8 @@ def videos(metrics: Mapping[str, Any]) -> Section:
         f"one; sampling seed {found['seed']}. FVD depends on the number of clips: compare it only "
         "at equal names. Halves compares half of the imagined clips with the truth of the others; "
         "the floor compares the truth of the same halves (mean ± standard deviation over random "
-        "halves). The closer the two, the less imagined and true clips can be told apart."
+        "halves). The closer the two, the less imagined and true clips can be told apart. Clips "
+        "compared over pixels seen before, or never seen, show the truth at all other pixels."
     )
     return Section.of_table("Videos as a whole", ["", *heads], rows, note)
 

@@ -34,6 +34,8 @@ NO_MEMORY = (
 )
 MASK_NAMES = {"seen": "seen before", "unseen": "never seen", "all": "all pixels"}
 """Labels of the masks."""
+PARTS = ("seen", "unseen")
+"""The masks of a part of the pixels."""
 METRIC_NAMES = {
     "psnr": ("PSNR, dB ↑", 2),
     "ssim": ("SSIM ↑", 3),
@@ -41,8 +43,7 @@ METRIC_NAMES = {
     "depth_rel": ("relative depth error ↓", 3),
     "lpips": ("LPIPS ↓", 3),
 }
-"""Heading and number of digits of each metric. LPIPS is measured on whole images; its heading names
-its network (``heading``)."""
+"""Heading and number of digits of each metric; that of LPIPS names its network (``heading``)."""
 COVERAGE_NAMES = {
     "held": "held by the map",
     "looked_at": "looked at by the model's reader",
@@ -162,9 +163,17 @@ def format_lpips(metrics: Mapping[str, Any]) -> str:
     found = {method: masks["all"].get("lpips") for method, masks in metrics["results"].items()}
     if not all(found.values()):
         return metrics["protocol"]["lpips"]
-    said = (f"{label} {number(found[method], 3)}" for method, label in labelled(found))
     name = metrics["protocol"].get("lpips_name") or "LPIPS"
-    return f"{name} of whole images, lower is better: {'; '.join(said)}."
+    said = f"{name} of whole images, lower is better: {_by_method(found)}."
+    for mask in PARTS:
+        within = {method: masks[mask].get("lpips") for method, masks in metrics["results"].items()}
+        if all(within.values()):
+            said += f" Over pixels {MASK_NAMES[mask]}: {_by_method(within)}."
+    return said
+
+
+def _by_method(found: Mapping[str, Any]) -> str:
+    return "; ".join(f"{label} {number(found[m], 3)}" for m, label in labelled(found))
 
 
 def format_fvd(metrics: Mapping[str, Any]) -> str:
@@ -179,6 +188,12 @@ def format_fvd(metrics: Mapping[str, Any]) -> str:
             for method, label in labelled(found["results"])
         )
         said.append(f"{name}, lower is better: {'; '.join(values)}")
+    for mask, results in found.get("masks", {}).items():
+        values = (
+            f"{label} {results[method]['kvd']['value']:.4g}" for method, label in labelled(results)
+        )
+        where = f"over pixels {MASK_NAMES[mask]}, with the truth elsewhere"
+        said.append(f"{found['names']['kvd']} {where}: {'; '.join(values)}")
     return f"{'. '.join(said)}."
 
 

@@ -151,7 +151,7 @@ class Checkpoints:
             STATE_ITEM: ocp.args.StandardRestore(_training_state(self.stage, like)),
         }
         read = self._read(items)
-        ema, frozen = tree.split(read[WEIGHTS_ITEM], self.stage.trained)
+        ema, frozen = tree.split(read[WEIGHTS_ITEM], self.stage.averaged)
         rest = read[STATE_ITEM]
         return TrainState(
             params=tree.merge(rest["trained"], frozen),

@@ -81,9 +81,10 @@ def _read(folder: Path) -> tuple[Config, Params]:
 
 
 def _shapes(config: Config, number: int) -> Params:
-    """Return the shapes of all parameters of a stage."""
+    """Return the shapes of the weights that a stage publishes."""
     stage = next(stage for stage in runs.all_stages(config) if stage.number == number)
-    return jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
+    shapes = jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
+    return stage.published(shapes)
 
 
 def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:

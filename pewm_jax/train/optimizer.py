@@ -7,6 +7,7 @@ norm. (``optax.masked`` alone would pass raw gradients through to them.)
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -19,7 +20,7 @@ from optax.contrib import MuonDimensionNumbers, scale_by_muon
 from pewm_jax.config import Config, StageConfig
 from pewm_jax.io import tree
 from pewm_jax.types import Params
-from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
+from pewm_jax.worlds.stages import ADVERSARY, FREEZE, TRAIN, Stage
 
 DECAYED = (
     (r"(.*/)?kernel", True),
@@ -48,7 +49,8 @@ def schedule(settings: StageConfig) -> optax.Schedule:
 
 def rate(settings: StageConfig, opt_state: optax.OptState) -> Array:
     """Return the learning rate of the next update; skipped updates are not counted."""
-    counted = optax.tree_utils.tree_get(opt_state, "ScaleByScheduleState")
+    chains = getattr(opt_state, "inner_states", {TRAIN: opt_state})
+    counted = optax.tree_utils.tree_get(chains[TRAIN], "ScaleByScheduleState")
     return jnp.asarray(schedule(settings)(counted.count))
 
 
@@ -71,7 +73,28 @@ def make(config: Config, stage: Stage) -> optax.GradientTransformation:
         optax.scale_by_learning_rate(schedule(settings)),
         *([_rates(stage)] if stage.rates else []),
     )
-    return optax.partition({TRAIN: trains, FREEZE: optax.set_to_zero()}, stage.labels)
+    chains = {TRAIN: trains, FREEZE: optax.set_to_zero()}
+    if stage.training_only:
+        chains[ADVERSARY] = adversary(config, settings)
+    return optax.partition(chains, stage.labels)
+
+
+ADVERSARY_BETAS = (0.5, 0.9)
+"""Adam's decays for a discriminator, as in latent diffusion."""
+
+
+def adversary(config: Config, settings: StageConfig) -> optax.GradientTransformation:
+    """Return the optimizer of a discriminator: Adam with the stage's schedule, but no warm-up.
+
+    Its gradients are clipped apart from those of the other parameters, so that neither of the two
+    scales the other's steps.
+    """
+    at_once = schedule(dataclasses.replace(settings, warmup=0))
+    return optax.chain(
+        optax.clip_by_global_norm(config.train.clip_norm),
+        optax.scale_by_adam(*ADVERSARY_BETAS),
+        optax.scale_by_learning_rate(at_once),
+    )
 
 
 MATRICES = (

@@ -38,7 +38,8 @@ class TrainState:
     Attributes:
         params: all parameters of the stage: trained ones in float32, frozen ones in the model's
             compute ``dtype``.
-        ema: exponential moving average of the trained parameters only.
+        ema: exponential moving average of the trained parameters only, without those that serve
+            training alone (``Stage.training_only``).
         opt_state: optimizer state; moments of the trained parameters only.
         step: () int32, steps done; also the position in the data.
     """
@@ -71,7 +72,7 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
     params = tree.merge(trained, jax.tree.map(lambda x: x.astype(config.model.dtype), frozen))
     return TrainState(
         params=params,
-        ema=jax.tree.map(jnp.copy, trained),
+        ema=jax.tree.map(jnp.copy, stage.published(trained)),
         opt_state=optimizer.make(config, stage).init(params),
         step=jnp.zeros((), jnp.int32),
     )
@@ -81,17 +82,19 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Non
     """Raise an error unless a stage can start from these weights.
 
     Leaves that match ``train.fresh`` may be missing and are initialized randomly: the memory blocks
-    of stage 2, which the weights of stage 1 do not contain. ``start`` and ``like``, all parameters
-    of the stage, may be their shapes.
+    of stage 2, which the weights of stage 1 do not contain. So may those that serve training alone,
+    which no weights contain. ``start`` and ``like``, all parameters of the stage, may be their
+    shapes.
 
     Raises:
         TreeError: another leaf is missing, a leaf is unexpected or has another shape; lists them.
     """
     leaves = tree.flatten(start)
+    lacking = (*config.train.fresh, *stage.training_only)
     wanted = {
         path: leaf
         for path, leaf in tree.flatten(like).items()
-        if path in leaves or not any(re.fullmatch(rule, path) for rule in config.train.fresh)
+        if path in leaves or not any(re.fullmatch(rule, path) for rule in lacking)
     }
     allowed = ", ".join(config.train.fresh) or "none"
     what = f"Initial weights of {stage.title} (may lack, by train.fresh: {allowed})"
@@ -158,7 +161,7 @@ def train_step(
     }
     after = TrainState(
         params=tree.merge(trained, frozen),
-        ema=update_ema(state.ema, trained, state.step, config.train.ema),
+        ema=update_ema(state.ema, stage.published(trained), state.step, config.train.ema),
         opt_state=opt_state,
         step=state.step + 1,
     )

@@ -2,25 +2,22 @@
 
 Stage ``codec`` trains it to reconstruct frames from noisy latents. Stage ``statistics`` fits mean
 and scale of the latents, by which the codec normalises them. If ``codec.gate`` is set, stage
-``gate`` trains the gate. Another model can start from the finished run (``train.start``).
+``gate`` trains the gate. Stage ``sharpen``, if it has steps, trains a converged decoder further
+against blur (``worlds.sharpen``). Another model can start from the finished run (``train.start``).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.codecs import gates, rgbd
+from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.learned import LearnedCodecConfig
-from pewm_jax.codecs.signals import (
-    as_signal,
-    depth_from_signal,
-    rgbd_signal,
-    signal_from_depth,
-)
+from pewm_jax.codecs.signals import as_signal, rgbd_signal, signal_from_depth
 from pewm_jax.config import (
     BatchSpec,
     ClipConfig,
@@ -34,25 +31,26 @@ from pewm_jax.config import (
 from pewm_jax.errors import require, require_fields
 from pewm_jax.geometry import depth_images
 from pewm_jax.memory import interface as memories
-from pewm_jax.models.lpips import convert as lpips_convert
 from pewm_jax.models.lpips import model as lpips
 from pewm_jax.registry import of, part
 from pewm_jax.types import Array, Camera, Clip, Frames, Params
-from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
+from pewm_jax.worlds import sharpen
+from pewm_jax.worlds.codec_losses import (
+    lpips_weights,
+    moments,
+    noisy_latents,
+    pixel_errors,
+    qualities,
+    score,
+)
+from pewm_jax.worlds.stages import ADVERSARY, FREEZE, TRAIN, Stage
 
-SMALL = 1e-4
-"""Added to variances."""
 PULL = 1e-2
 """Weight of the term that keeps each channel of the latents near mean 0 and variance 1."""
-ABSOLUTE = 0.1
-"""Weight of the absolute error beside the squared one."""
-LPIPS: lpips.Net = "alex"
-"""The network of LPIPS in the loss."""
-EASY = 1e-3
-"""Errors of a frame below this no longer matter."""
 STATISTICS = r"codec/latent_(mean|scale)_C"
 NETWORKS = r"codec/(encoder|decoder)/.*"
 GATE = r"codec/gate/.*"
+ENCODER, DECODER = r"codec/encoder/.*", r"codec/decoder/.*"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,16 +74,27 @@ class CodecTrainConfig(TrainSettings):
     gate_noise: float = 0.8
     """Largest noise on the latents in stage `gate`, as a share of their deviation; each clip draws
     its own."""
+    gate_lpips: float = 0.0
+    """Weight of LPIPS of the mixed colours in stage `gate`; 0 disables it."""
+    sharpen: StageConfig = StageConfig(steps=0, batch=16, learning_rate=3e-4)
+    """The decoder is trained further to be sharp, all else is frozen; 0 steps disable it. It needs
+    a decoder that has converged, and frames of 24 × 24 pixels or more."""
+    sharpen_lpips: float = 1.0
+    """Weight of LPIPS in stage `sharpen`, relative to the absolute error; 0 disables it."""
+    gan_weight: float = 0.5
+    """Weight of the discriminator in stage `sharpen`: its gradient in the decoder's last layer, as
+    a share of that of the absolute error and LPIPS; 0 disables it."""
     latent_noise: float = 0.05
-    """Noise on the latents in stage `codec`, as a share of each channel's deviation."""
+    """Noise on the latents in stages `codec` and `sharpen`, as a share of each channel's
+    deviation."""
     gradient_weight: float = 1.0
     """Weight of the absolute error of differences between neighbouring pixels, relative to that of
     the pixels."""
     squared_weight: float = 4.0
     """Weight of the squared error."""
     lpips_weight: float = 0.0
-    """Weight of LPIPS, a learned distance between images, of the reconstructed colours; 0 disables
-    it."""
+    """Weight of LPIPS, a learned distance between images, of the reconstructed colours in stage
+    `codec`; 0 disables it."""
     lpips_net: Literal["alex", "vgg"] = "alex"
     """The network of LPIPS: AlexNet, or VGG16, which its authors recommend as a loss and which
     costs 30 times as much."""
@@ -96,8 +105,8 @@ class CodecTrainConfig(TrainSettings):
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
-        weights = ("gradient_weight", "squared_weight", "lpips_weight")
-        names = ("latent_noise", "gate_noise", *weights)
+        weights = ("gradient_weight", "squared_weight", "lpips_weight", "gate_lpips")
+        names = ("latent_noise", "gate_noise", *weights, "sharpen_lpips", "gan_weight")
         require_fields(self, "train", lambda value: value >= 0, "0 or more", *names)
 
 
@@ -160,6 +169,14 @@ class CodecTask(Task):
         plain = dataclasses.replace(self.codec, gate=0)
         return dataclasses.replace(self, codec=plain).init(key)
 
+    def _with_discriminator(self, key: Array) -> Params:
+        """Return random parameters of all, and of the discriminator."""
+        return {**self.init(key), **sharpen.init(key)}
+
+    def _require_discriminator(self) -> None:
+        """Refuse frames that are too small for the discriminator."""
+        sharpen.require_size(self.clip.height, self.clip.width)
+
     def pictures(self, clip: Clip) -> tuple[Array, Array]:
         """Return a batch's frames as the codec's input, and which pixels count.
 
@@ -192,25 +209,12 @@ class CodecTask(Task):
         """
         assert isinstance(train, CodecTrainConfig)
         truth, counts = self.pictures(clip)
-        weights, codec = params["codec"], self.codec
-        latents = codec.encode_raw(weights, truth.astype(self.dtype))
-        latents = latents.astype(jnp.float32)
-        mean, variance = _moments(latents)
-        noise = jax.random.normal(key, latents.shape) * jnp.sqrt(variance)
-        noisy = (latents + train.latent_noise * noise).astype(self.dtype)
-        made = codec.decode_raw(weights, noisy).astype(jnp.float32)
+        weights = params["codec"]
+        noisy, mean, variance = noisy_latents(self, train.latent_noise, weights, truth, key)
+        made = self.codec.decode_raw(weights, noisy).astype(jnp.float32)
 
-        error = (made - truth) * counts
-        pixels = jnp.maximum(counts.sum((1, 2, 3, 4)), 1) * error.shape[-1]
-        absolute = jnp.abs(error).sum((1, 2, 3, 4)) / pixels
-        squared = jnp.square(error).sum((1, 2, 3, 4)) / pixels
-        gradients = _of_neighbours(made - truth, counts, 2) + _of_neighbours(
-            made - truth, counts, 3
-        )
-        each = absolute + train.gradient_weight * gradients + train.squared_weight * squared
+        each, squared = pixel_errors(train, made, truth, counts)
         pull = jnp.square(mean).mean() + jnp.square(jnp.log(variance)).mean()
-        off = depth_from_signal(self.clip, made[1].mean(-1))
-        off = jnp.abs(off - depth_from_signal(self.clip, truth[1, ..., 0])) * counts[1, ..., 0]
         loss, perceived = each.mean() + PULL * pull, {}
         if train.lpips_weight:
             apart = lpips.apply(train.lpips_net, params["lpips"], made[0], truth[0]).mean()
@@ -218,14 +222,52 @@ class CodecTask(Task):
         return loss, perceived | {
             "loss_rgb": each[0],
             "loss_depth": each[1],
-            "psnr_rgb": -10 * jnp.log10(jnp.maximum(squared[0] / 4, 1e-10)),
-            "depth_m": off.sum() / jnp.maximum(counts[1].sum(), 1),
+            **qualities(self, made, truth, counts, squared),
         }
 
-    def perceptual(self, train: TrainSettings) -> Params | None:
-        """Return the weights that ``reconstruct`` needs, or None; see ``lpips_weights``."""
+    def sharpened(
+        self, train: TrainSettings, params: Params, clip: Clip, key: Array
+    ) -> tuple[Array, dict[str, Array]]:
+        """Return the loss of stage ``sharpen``; see ``worlds.sharpen``.
+
+        Colours have an absolute error, LPIPS and the discriminator, depth the error of stage
+        ``codec``.
+
+        Returns:
+            ``(loss, measured)``: those of ``reconstruct`` and of ``sharpen.loss``.
+        """
         assert isinstance(train, CodecTrainConfig)
-        if not train.lpips_weight:
+        truth, counts = self.pictures(clip)
+        weights = params["codec"]
+        noisy, _, _ = noisy_latents(self, train.latent_noise, weights, truth, key)
+
+        def decode(decoder: Params) -> Array:
+            made = self.codec.decode_raw({**weights, "decoder": decoder}, noisy)
+            return made.astype(jnp.float32)
+
+        def perceived(made_NHWC: Array) -> Array:
+            return lpips.apply(train.lpips_net, params["lpips"], made_NHWC, truth[0]).mean()
+
+        made = decode(weights["decoder"])
+        each, squared = pixel_errors(train, made, truth, counts)
+        loss, measured = sharpen.loss(
+            made[0],
+            truth[0],
+            params["discriminator"],
+            pull=sharpen.pull_of_last(lambda decoder: decode(decoder)[0], weights["decoder"]),
+            lpips=perceived if train.sharpen_lpips else None,
+            lpips_weight=train.sharpen_lpips,
+            gan_weight=train.gan_weight,
+        )
+        return loss + each[1], measured | {
+            "loss_depth": each[1],
+            **qualities(self, made, truth, counts, squared),
+        }
+
+    def perceptual(self, train: TrainSettings, weight: str = "lpips_weight") -> Params | None:
+        """Return the weights that a loss with this weight of LPIPS needs; see ``lpips_weights``."""
+        assert isinstance(train, CodecTrainConfig)
+        if not getattr(train, weight):
             return None
         return lpips_weights(train.lpips_net, self.clip, train.lpips_file)
 
@@ -241,7 +283,7 @@ class CodecTask(Task):
         latents = self.codec.encode(params["codec"], truth.astype(self.dtype))
         latents = latents.astype(jnp.float32)
         scale = jnp.abs(params["codec"]["latent_scale_C"])
-        mean, variance = _moments(latents)
+        mean, variance = moments(latents)
         loss = (jnp.square(latents) / 2).mean() + jnp.log(scale).mean()
         return loss, {
             "latent_mean": jnp.abs(mean).max(),
@@ -285,109 +327,42 @@ class CodecTask(Task):
         level = jax.random.uniform(level_key, (len(latents), 1, 1, 1, 1), maxval=train.gate_noise)
         noisy = latents + level * jax.random.normal(noise_key, latents.shape)
         rgb, depth = rgbd.decode_rgbd(self, params, noisy)  # type: ignore[arg-type]
-        return score(self, params["codec"]["gate"], rgb, depth, shown_BTHWC, seen_BTHW, later)
+        gate = params["codec"]["gate"]
+        perceptual = (train.gate_lpips, params["lpips"]) if train.gate_lpips else None
+        given = rgb, depth, shown_BTHWC, seen_BTHW, later, perceptual
+        return score(self, gate, *given, net=train.lpips_net)
 
     def stages(self) -> tuple[Stage, ...]:
-        """Return the stages: two, and one for the gate if there is one."""
+        """Return the stages: two, one for the gate if there is one, and one that sharpens.
+
+        The last is skipped without steps. A gate is trained on decoded frames, so a decoder is
+        sharpened first, in a run of its own; sharpened in the run of its gate, it keeps the gate.
+        """
         first = ((STATISTICS, FREEZE), (NETWORKS, TRAIN))
         second = ((STATISTICS, TRAIN), (NETWORKS, FREEZE))
         third = ((GATE, TRAIN), (STATISTICS, FREEZE), (NETWORKS, FREEZE))
+        fourth = ((DECODER, TRAIN), (sharpen.DISCRIMINATOR, ADVERSARY))
+        fourth = (*fourth, (ENCODER, FREEZE), (STATISTICS, FREEZE), (GATE, FREEZE))
         init, weights = CodecTask._without_gate, CodecTask.perceptual
+        of_gate = functools.partial(weights, weight="gate_lpips")
+        of_sharpen = functools.partial(weights, weight="sharpen_lpips")
         stages = (
             Stage("codec", 1, first, init, CodecTask.reconstruct, extra_weights=weights),
             Stage("statistics", 2, second, init, CodecTask.distribute),
-            Stage("gate", 3, third, CodecTask.init, CodecTask.mix),
+            Stage("gate", 3, third, CodecTask.init, CodecTask.mix, extra_weights=of_gate),
+            Stage(
+                name="sharpen",
+                number=4,
+                rules=fourth,
+                init=CodecTask._with_discriminator,
+                loss=CodecTask.sharpened,
+                optional=True,
+                extra_weights=of_sharpen,
+                require=CodecTask._require_discriminator,
+            ),
         )
-        return stages if self.codec.gate else stages[:2]
+        return stages if self.codec.gate else (*stages[:2], stages[3])
 
     def sharding(self) -> tuple[tuple[str, Any], ...]:
-        """Return the codec's rules."""
-        return self.codec.SHARDING
-
-
-def lpips_weights(net: lpips.Net, clip: ClipConfig, file: str = "") -> Params:
-    """Return the weights of LPIPS from a file, or of the installed package, under ``lpips``.
-
-    Raises:
-        UserError: they are absent, damaged, or of another network, or the frames are too small.
-    """
-    found = {"lpips": lpips_convert.read(lpips_convert.find(net, file), net)[1]}
-    lpips.require_size(net, clip.height, clip.width)
-    return found
-
-
-def _moments(latents: Array) -> tuple[Array, Array]:
-    """Return the mean and the variance of each channel."""
-    places = tuple(range(latents.ndim - 1))
-    return latents.mean(places), latents.var(places) + SMALL
-
-
-def _of_neighbours(error: Array, counts: Array, axis: int) -> Array:
-    """Return the mean absolute difference between neighbours along an axis, (2,)."""
-
-    def cut(x: Array, first: int, last: int) -> Array:
-        return jax.lax.slice_in_dim(x, first, last, axis=axis)
-
-    size = error.shape[axis]
-    both = cut(counts, 1, size) * cut(counts, 0, size - 1)
-    apart = jnp.abs(cut(error, 1, size) - cut(error, 0, size - 1)) * both
-    return apart.sum((1, 2, 3, 4)) / (jnp.maximum(both.sum((1, 2, 3, 4)), 1) * error.shape[-1])
-
-
-def score(
-    model: Any,
-    gate: Params,
-    rgb_BTHWC: Array,
-    depth_BTHW: Array,
-    shown_BTHWC: Array,
-    seen_BTHW: Array,
-    truth: Frames,
-    perceptual: tuple[float, Params] | None = None,
-) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of a gate on decoded frames and the rendered memory.
-
-    Decoded depth is in metres; ``shown_BTHWC`` has colour and depth signal of the memory, 4
-    channels, and ``seen_BTHW`` is True where it shows anything. ``perceptual`` is a weight and the
-    weights of LPIPS, which is then added and measured.
-
-    Returns:
-        ``(loss, measured)``: the logarithm of each frame's squared error plus a little absolute
-        error, of colour and of measured depth, so that frames with few pixels seen before do not
-        outweigh the others; PSNR of colour in decibels, of the gate's result and of the decoded
-        frames, and where anything was rendered also of the rendering; ``depth_m``, the mean
-        absolute error of the gate's depth.
-    """
-    decoded = rgbd_signal(model.clip, rgb_BTHWC, depth_BTHW)
-    wanted = rgbd_signal(model.clip, truth.rgb_THWC, truth.depth_THW)
-    shape = (-1, *wanted.shape[-3:])
-    decoded, shown, wanted = (x.reshape(shape) for x in (decoded, shown_BTHWC, wanted))
-    decoded = jax.lax.stop_gradient(decoded)
-    seen = seen_BTHW.reshape(-1, *wanted.shape[1:3])
-    made = gates.apply(gate, decoded, shown, seen)
-    depth = truth.depth_THW.reshape(seen.shape)
-    measured = (depth > 0).astype(made.dtype)
-    counts = jnp.stack([jnp.ones_like(measured)] * 3 + [measured], -1)
-    error = (made - wanted) * counts
-    each = jnp.square(error) + ABSOLUTE * jnp.abs(error)
-    each = each.sum((1, 2, 3)) / jnp.maximum(counts.sum((1, 2, 3)), 1)
-    loss = jnp.log(each + EASY).mean()
-    perceived = {}
-    if perceptual is not None:
-        weight, network = perceptual
-        apart = lpips.apply(LPIPS, network, made[..., :3], wanted[..., :3]).mean()
-        loss, perceived = loss + weight * apart, {"lpips": apart}
-    off = jnp.abs(depth_from_signal(model.clip, made[..., 3]) - depth)
-    hit = seen[..., None].astype(made.dtype)
-    return loss, perceived | {
-        "psnr_rgb": _psnr(made, wanted, jnp.ones_like(hit)),
-        "psnr_decoded": _psnr(decoded, wanted, jnp.ones_like(hit)),
-        "psnr_seen": _psnr(made, wanted, hit),
-        "psnr_rendered": _psnr(shown, wanted, hit),
-        "depth_m": (off * measured).sum() / jnp.maximum(measured.sum(), 1),
-    }
-
-
-def _psnr(made: Array, truth: Array, where: Array) -> Array:
-    """Return the PSNR of colour in decibels, of the pixels where ``where`` is 1."""
-    squared = (jnp.square(made - truth)[..., :3] * where).sum() / jnp.maximum(3 * where.sum(), 1)
-    return -10 * jnp.log10(jnp.maximum(squared / 4, 1e-10))
+        """Return the codec's rules, and the discriminator's."""
+        return (*self.codec.SHARDING, *sharpen.SHARDING)

@@ -51,7 +51,7 @@ def _expected(config: Config, params: Params) -> Params:
     """Return the shapes of the parameters that weights of a finished stage have."""
     key = jax.random.key(0)
     made = [
-        jax.eval_shape(functools.partial(stage.init, config.model), key)
+        stage.published(jax.eval_shape(functools.partial(stage.init, config.model), key))
         for stage in worlds.stages(config.model)
     ]
     found = tree.flatten(params).keys()

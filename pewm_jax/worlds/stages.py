@@ -22,7 +22,9 @@ from pewm_jax.config import Config, StageConfig, Task, UserError
 from pewm_jax.io import tree
 from pewm_jax.types import Array, Clip, Params
 
-TRAIN, FREEZE = "train", "freeze"
+TRAIN, FREEZE, ADVERSARY = "train", "freeze", "adversary"
+"""What a stage does with a parameter: it trains it, keeps it, or trains it as the part of a
+discriminator, which has an optimizer of its own and serves training alone."""
 
 Loss = Callable[..., tuple[Array, dict[str, Array]]]
 """``loss(model, train, params, clip, key) -> (loss, measured)``: the loss of a batch of clips with
@@ -36,8 +38,8 @@ class Stage:
     Attributes:
         name: names its settings (``train.NAME``), folders and log entries.
         number: its place among the world's stages, from 1; seeds its weights, noise and data order.
-        rules: (pattern, ``TRAIN`` or ``FREEZE``) over parameter paths, the first match wins (see
-            ``pewm_jax.io.tree``); a leaf that no rule matches is an error.
+        rules: (pattern, ``TRAIN``, ``FREEZE`` or ``ADVERSARY``) over parameter paths, the first
+            match wins (see ``pewm_jax.io.tree``); a leaf that no rule matches is an error.
         init: ``init(model, key) -> params``, all the parameters that the stage needs.
         loss: the function to minimise.
         memory: whether it reads the clips' context, and so may use cached image features.
@@ -76,10 +78,24 @@ class Stage:
     @property
     def trained(self) -> tuple[str, ...]:
         """The path patterns of the trained parameters."""
+        return tuple(pattern for pattern, label in self.rules if label in (TRAIN, ADVERSARY))
+
+    @property
+    def averaged(self) -> tuple[str, ...]:
+        """The path patterns of the trained parameters whose moving average is published."""
         return tuple(pattern for pattern, label in self.rules if label == TRAIN)
 
+    @property
+    def training_only(self) -> tuple[str, ...]:
+        """The path patterns of trained parameters that are in checkpoints, but in no weights."""
+        return tuple(pattern for pattern, label in self.rules if label == ADVERSARY)
+
+    def published(self, params: Params) -> Params:
+        """Return parameters without those that serve training alone."""
+        return tree.exclude(params, self.training_only) if self.training_only else params
+
     def labels(self, params: Any) -> Any:
-        """Return a tree of ``TRAIN`` and ``FREEZE``, one per parameter, for the optimizer.
+        """Return a tree of the rules' labels, one per parameter, for the optimizer.
 
         Raises:
             TreeError: leaves that no rule matches.

@@ -18,6 +18,7 @@ from pewm_jax.eval import compare, results
 from pewm_jax.eval import protocol as protocols
 from pewm_jax.eval.clips import ClipChoice
 from pewm_jax.eval.long_rollouts import LongRollouts
+from pewm_jax.eval.metrics.images import MASKS
 from pewm_jax.eval.protocol import ClipKey, EpisodeKey, Protocol
 from pewm_jax.eval.scoring import Scored
 from tests import properties
@@ -229,6 +230,46 @@ def test_lpips_of_different_networks_is_left_out(tmp_path, errors):
     one = compare.compare(tmp_path / "a", tmp_path / "c", log=lambda _: None)
     assert content(one)["measured_by_one"] == ["lpips"]
     assert "only one of the two was measured with it" in one.read_text()
+
+
+def video_scores(value, masks=("seen", "unseen")):
+    """FVD and KVD of a report; an earlier version has no masks."""
+    table = {"memory": {kind: {"value": value} for kind in ("fvd", "kvd")}}
+    found = {"names": {"fvd": "FVD-9f@12", "kvd": "KVD-9f@12"}, "results": table}
+    return found | ({"masks": dict.fromkeys(masks, table)} if masks else {})
+
+
+@pytest.mark.slow
+def test_masked_lpips_is_paired_and_reports_without_it_can_be_compared(tmp_path, errors):
+    for name, masks, gain in (("a", MASKS, 0.1), ("b", MASKS, 0), ("c", (), 0)):
+        folder = report(tmp_path / name, errors)
+        read = results.load_samples(folder / "report")
+        lpips = {
+            f"{part}/memory/{mask}/lpips": read.arrays[f"{part}/memory/{mask}/psnr"] / 100 + gain
+            for part in results.PARTS
+            for mask in {*masks, "all"}
+        }
+        samples = results.Samples(read.about, {**read.arrays, **lpips})
+        results.save_samples(folder / "report", samples)
+        path = folder / "report" / "metrics.json"
+        metrics = json.loads(path.read_text())
+        metrics["videos"] = video_scores(10 + gain, masks[:2])
+        path.write_text(json.dumps(metrics))
+    page = compare.compare(tmp_path / "a", tmp_path / "b", log=lambda _: None)
+    found = content(page)
+    for mask in ("seen", "unseen", "all"):
+        assert found["differences"]["clips"][mask]["lpips"]["mean"] == pytest.approx(0.1)
+        assert found["videos"]["a"][mask] == {"fvd": 10.1, "kvd": 10.1}
+    assert found["masked_by_one"] == []
+    assert "KVD-9f@12" in page.read_text()
+    page = compare.compare(tmp_path / "a", tmp_path / "c", log=lambda _: None)
+    found = content(page)
+    assert found["masked_by_one"] == ["lpips"]
+    assert found["measured_by_one"] == []
+    assert "lpips" not in found["differences"]["clips"]["seen"]
+    assert found["differences"]["clips"]["all"]["lpips"]["mean"] == pytest.approx(0.1)
+    assert set(found["videos"]["a"]) == {"all"}
+    assert "only one of the two reports has it" in page.read_text()
 
 
 @pytest.mark.slow

@@ -356,6 +356,10 @@ def test_lpips_is_scored_where_weights_are_given_and_else_said_to_be_left_out(co
     assert found["copy"] != found["memory"]
     assert metrics["margins"]["empty"]["all"]["lpips"]["mean"] == pytest.approx(0, abs=1e-3)
     assert len(metrics["long"]["per_frame"]["copy"]["all"]["lpips"]["mean"]) == 8
+    for mask in ("seen", "unseen"):
+        for part in (metrics, metrics["long"], metrics["houses"]):
+            assert part["results"]["copy"][mask]["lpips"]["mean"] > 0
+            assert "lpips" in part["margins"]["reproject"][mask]
     assert metrics["protocol"]["lpips_weights_sha256"] == report.file_hash(path)
     page = (copied / "report" / "index.html").read_text()
     name = f"LPIPS[vgg-{tree.digest(weights.load(path))[:8]}]"  # weights of one's own

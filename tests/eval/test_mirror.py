@@ -20,6 +20,7 @@ from pewm_jax.eval.scoring import Scored, score_table
 from pewm_jax.geometry.actions import integrate
 from pewm_jax.io.store import ResultCache
 from pewm_jax.models.i3d import convert as i3d_weights
+from pewm_jax.report.labels import format_fvd
 from tests.eval.scene import knowing_rollout, tiny, write_split
 
 SAMPLED = {"memory", "empty"}
@@ -132,6 +133,8 @@ def test_videos_are_compared_as_wholes_and_their_features_kept(scene, tmp_path, 
     scored = score_table(config, episodes, methods, partials, print, i3d=i3d)
     assert len(calls) == 2 * 2  # the first seed again, of two batches
     assert set(scored.features) == {*methods.names, "truth"}
+    assert set(scored.composites) == {"seen", "unseen"}
+    assert all(set(found) == set(methods.names) for found in scored.composites.values())
     assert scored.features["copy"].shape == (4, 5 * 3)  # the observed frame with the imagined
     copied = scored.features["copy"].reshape(4, 5, 3)
     np.testing.assert_allclose(copied, copied[:, :1].repeat(5, 1), atol=1e-6)
@@ -147,6 +150,14 @@ def test_videos_are_compared_as_wholes_and_their_features_kept(scene, tmp_path, 
     values = {method: found["results"][method]["fvd"]["value"] for method in methods.names}
     assert values["memory"] < 1e-3 < values["empty"]
     assert found["results"]["copy"]["fvd"]["floor"]["mean"] > 0
+    for mask, table in found["masks"].items():
+        assert set(table) == set(methods.names)
+        within = {method: entry["fvd"]["value"] for method, entry in table.items()}
+        assert within["memory"] < 1e-3 < within["empty"], mask
+        assert table["memory"]["kvd"]["value"] == pytest.approx(0, abs=1e-2)
+        assert table["copy"]["kvd"]["floor"] == found["results"]["copy"]["kvd"]["floor"]
+    said = format_fvd({"videos": found, "protocol": {}})
+    assert "KVD-5f@4 over pixels never seen, with the truth elsewhere: with its map" in said
     one = Scored(again.choices[:1], {n: x[:1] for n, x in again.features.items()})
     one = Scored(one.choices, {}, {n: x[:1] for n, x in again.features.items()})
     assert results.videos(config, one, i3d) is None

@@ -70,6 +70,23 @@ def test_a_model_that_remembers_wins_by_a_mile(knowing_model, episodes, tmp_path
     assert gain["mean"] > 35
 
 
+def test_a_composite_shows_the_truth_outside_its_mask(knowing_model, episodes, tmp_path):
+    config = tiny(tmp_path, clips=2)
+    some = choose(config, episodes, 2, 1)
+    batch = scoring.load_batch(config, episodes, some, 0, cameras=False)
+    truth = np.asarray(batch.whole(batch.targets.rgb_THWC))
+    wrong = -truth[:, 1:]
+    for mask, within in (("seen", batch.seen), ("unseen", batch.unseen)):
+        found = np.asarray(batch.composite(wrong, mask))
+        inside = np.asarray(within)[..., None]
+        np.testing.assert_array_equal(found[:, 0], truth[:, 0])  # the observed frame
+        wanted = np.where(inside, wrong, truth[:, 1:])
+        np.testing.assert_allclose(found[:, 1:], wanted, atol=1e-6)
+        # An error outside the mask alone is no error.
+        outside = np.where(inside, truth[:, 1:], wrong)
+        np.testing.assert_allclose(batch.composite(outside, mask), truth, atol=1e-6)
+
+
 def test_a_model_that_is_one_frame_late_is_noticed(knowing_model, episodes, tmp_path):
     config = tiny(tmp_path, clips=2)
     model = knowing_model(late=1)

@@ -1,6 +1,7 @@
 """The learned codec is trained by the trainer of world models, scored, and started from."""
 
 import dataclasses
+import functools
 import json
 
 import jax
@@ -350,6 +351,20 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
     assert result["episodes"] == 6
     numbers = result["numbers"]
     assert f"depth error, cm                {numbers['depth_cm']['mean']:.3f} ± " in out
+    assert 0 < numbers["ssim"]["mean"] < 1
+    assert result["in_loss"] == []
+    assert result["videos"] is None
+    assert "FVD and KVD are not measured: I3D needs 9 frames, and an episode has 3." in out
+
+    file = tmp_path / "vgg.safetensors"
+    weights.save(file, jax.jit(lpips.init, static_argnums=0)("vgg", jax.random.key(0)))
+    assert program.execute(["evaluate", *argv, "--lpips", str(file)]) == 0
+    result = json.loads((run / "report" / "codec-validation.json").read_text())
+    (name,) = (name for name in result["numbers"] if name.startswith("lpips"))
+    assert name.startswith("lpips_vgg-")  # weights of one's own have their hash in the name
+    assert f"LPIPS[{name.removeprefix('lpips_')}]" in capsys.readouterr().out
+    with pytest.raises(UserError, match="--fvd is on, and episodes are too short for it"):
+        program.execute(["evaluate", *argv, "--fvd", "on"])
 
     config, params = pewm_jax.load(run)
     one = codec_score.EpisodeSource(data / "validation")[0].frames()
@@ -368,3 +383,30 @@ def test_its_numbers_are_printed_by_evaluate(clips, tmp_path, capsys):
         codec_score.score(run, data=data, split="validation")
     with pytest.raises(ConfigError, match="omit --seeds, --steps"):
         program.execute(["evaluate", str(run), "--steps", "2", "--seeds", "0"])
+
+
+def test_the_networks_that_judge_are_those_installed_and_the_one_in_the_loss_is_named(
+    tmp_path, monkeypatch
+):
+    made = jax.jit(lpips.init, static_argnums=0)
+    files = {net: tmp_path / f"{net}.safetensors" for net in ("alex", "vgg")}
+    for net, file in files.items():
+        weights.save(file, made(net, jax.random.key(0)))
+    monkeypatch.setattr(lpips_weights, "installed", files.get)
+    choose = functools.partial(codec_score.choose_judges, accelerator=False)
+    found = choose("", "off", 64, 48, 16)
+    assert set(found.lpips) == {"lpips_alex", "lpips_vgg"}
+    assert set(choose("", "off", 16, 48, 16).lpips) == {"lpips_vgg"}
+    assert choose("off", "off", 64, 48, 16).lpips == {}
+    monkeypatch.setattr(lpips_weights, "installed", lambda _: None)
+    found = choose("", "", 64, 48, 16)
+    assert found.lpips == {}
+    assert found.i3d is None
+    assert "no weights are installed" in found.about[0]
+    assert "FVD and KVD are not measured" in found.about[1]
+
+    steps = StageConfig(steps=1)
+    assert codec_score.in_loss(CodecTrainConfig()) == []
+    assert codec_score.in_loss(CodecTrainConfig(sharpen=steps, lpips_net="vgg")) == ["lpips_vgg"]
+    assert codec_score.in_loss(CodecTrainConfig(sharpen=steps, sharpen_lpips=0)) == []
+    assert codec_score.in_loss(CodecTrainConfig(lpips_weight=1)) == ["lpips_alex"]

@@ -13,7 +13,7 @@ from pewm_jax.codecs import gates
 from pewm_jax.codecs.learned import LearnedCodecConfig
 from pewm_jax.config import ClipConfig, Config, ConfigError, DataConfig, StageConfig, UserError
 from pewm_jax.data import abstract
-from pewm_jax.io import tree
+from pewm_jax.io import tree, weights
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
@@ -22,6 +22,7 @@ from pewm_jax.readers.render import RenderConfig
 from pewm_jax.train import loop, runs
 from pewm_jax.types import Frames
 from pewm_jax.worlds import codec as codec_gate
+from pewm_jax.worlds import codec_losses, sharpen
 from pewm_jax.worlds.codec import CodecTask, CodecTrainConfig
 from pewm_jax.worlds.rollouts import load_finished
 from tests.helpers import TINY, random_camera, random_world, tiny_config
@@ -200,6 +201,75 @@ def test_lpips_of_the_mixed_frames_counts_as_much_as_it_weighs(monkeypatch):
         LAST.extra_weights(model, train)
     with pytest.raises(ConfigError, match=r"train\.gate_lpips is -1"):
         dataclasses.replace(train, gate_lpips=-1)
+
+
+def test_the_gate_is_sharpened_alone_and_by_its_discriminator():
+    rng = np.random.default_rng(0)
+    model, shape = imagining().model, (1, 2, 32, 32)
+    truth = Frames(
+        jnp.asarray(rng.uniform(-1, 1, (*shape, 3)), jnp.float32),
+        jnp.asarray(rng.uniform(1, 3, shape), jnp.float32),
+        None,
+    )
+    given = (
+        jnp.asarray(rng.uniform(-1, 1, (*shape, 3)), jnp.float32),
+        jnp.asarray(rng.uniform(1, 3, shape), jnp.float32),
+        jnp.asarray(rng.uniform(-1, 1, (*shape, 4)), jnp.float32),
+        jnp.asarray(rng.random(shape) < 0.7),
+    )
+    params = {"codec": {"gate": jax.jit(gates.init, static_argnums=0)(8, jax.random.key(1))}}
+    params |= jax.jit(sharpen.init)(jax.random.key(2))
+    train = dataclasses.replace(imagining().train, sharpen_lpips=0.0)
+
+    @jax.jit
+    def loss(params):
+        return codec_losses.sharpen_gate(model, train, params, *given, truth)
+
+    (_, measured), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+    assert {"loss_rgb", "gan_scale", "loss_discriminator", "loss_depth"} <= measured.keys()
+    for part in (gradient["codec"]["gate"]["out"], gradient["discriminator"]["conv_0"]):
+        assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(part))
+
+    stage = worlds.stages(model)[-1]
+    assert (stage.name, stage.number, stage.optional) == ("sharpen", 5, True)
+    shapes = jax.eval_shape(lambda key: stage.init(model, key), jax.random.key(0))
+    labels = tree.flatten(stage.labels(shapes))
+    assert {path.split("/")[0] for path, label in labels.items() if label == "adversary"} == {
+        "discriminator"
+    }
+    assert {path.rsplit("/", 3)[0][:10] for path, x in labels.items() if x == "train"} == {
+        "codec/gate"
+    }
+    assert "discriminator" not in stage.published(shapes)
+    with pytest.raises(UserError, match="too small for the discriminator"):
+        stage.require(model)
+    assert LAST.name == worlds.stages(tiny_config())[-1].name == "gate"
+    steps = dataclasses.replace(train, sharpen=StageConfig(steps=1))
+    with pytest.raises(
+        ConfigError, match=r"train\.sharpen\.steps is 1, but this model has no gate"
+    ):
+        dataclasses.replace(tiny_config(), train=steps)
+    assert dataclasses.replace(imagining(), train=steps).train.sharpen.steps == 1
+
+
+@pytest.mark.slow
+def test_lpips_counts_in_the_codecs_gate_stage(tmp_path):
+    file = tmp_path / "alex.safetensors"
+    weights.save(file, jax.jit(lpips.init, static_argnums=0)("alex", jax.random.key(0)))
+    config = experiment()
+    config = config.with_model(clip=dataclasses.replace(config.model.clip, height=32, width=32))
+    stage = worlds.stages(config)[2]
+    assert stage.extra_weights(config.model, config.train) is None
+    train = dataclasses.replace(config.train, gate_lpips=0.5, lpips_file=str(file))
+    given = stage.extra_weights(config.model, train)
+    params = jax.jit(worlds.init, static_argnums=0)(config, jax.random.key(0))
+    like = abstract.clip(config, 1)
+    clip = jax.tree.map(lambda x: np.ones(x.shape, x.dtype), like)
+    loss = jax.jit(stage.loss, static_argnums=(0, 1))
+    whole, measured = loss(config.model, train, params | given, clip, jax.random.key(1))
+    without, few = loss(config.model, config.train, params, clip, jax.random.key(1))
+    assert "lpips" not in few
+    assert float(whole) == pytest.approx(float(without + 0.5 * measured["lpips"]), rel=1e-4)
 
 
 def test_without_a_gate_there_is_nothing_to_learn():

@@ -28,9 +28,12 @@ PSNR_CEILING = 100.0
 """PSNR of equal images, in dB; it keeps averages finite."""
 MASKS = ("seen", "unseen", "all")
 """The masks: pixels seen before, pixels never seen, all pixels."""
+PARTS = MASKS[:2]
+"""The masks of a part of the pixels."""
 MEASURED = ("squared", "colours", "ssim", "windows", "depth_abs", "depth_rel", "depths")
 SUMS = (*MEASURED, "lpips", "pictures")
-"""The sums returned by ``error_sums``, in order; the last two are 0 until ``with_lpips``."""
+"""The sums returned by ``error_sums``, in order; the last two are 0 until ``with_lpips``, and count
+pixels under the masks of ``PARTS`` and pictures under ``all``."""
 
 
 def unit_colours(rgb: Array) -> Array:
@@ -124,11 +127,22 @@ error_sums_batch = jax.jit(jax.vmap(error_sums))
 """``error_sums`` over a batch of clips: (B, T, 3, 9)."""
 
 
-def with_lpips(sums: np.ndarray, distances: np.ndarray) -> np.ndarray:
-    """Return sums (..., T, 3, 9) with LPIPS (..., T), of whole images: only under ``all``."""
+def with_lpips(
+    sums: np.ndarray, distances: np.ndarray, in_masks: np.ndarray | None = None
+) -> np.ndarray:
+    """Return sums (..., T, 3, 9) with LPIPS (..., T) of whole images under ``all``.
+
+    ``in_masks`` (..., T, 2) are the sums of its map over the pixels seen before and never seen
+    (``perceptual.LPIPS.in_masks``). Their count is that of the pixels, so that frames weigh as many
+    pixels as they have under the mask, as for PSNR; whole images weigh the same.
+    """
     sums = np.array(sums)
     sums[..., MASKS.index("all"), SUMS.index("lpips")] = distances
     sums[..., MASKS.index("all"), SUMS.index("pictures")] = 1
+    if in_masks is not None:
+        parts = [MASKS.index(mask) for mask in PARTS]
+        sums[..., parts, SUMS.index("lpips")] = in_masks
+        sums[..., parts, SUMS.index("pictures")] = sums[..., parts, SUMS.index("colours")] / 3
     return sums
 
 

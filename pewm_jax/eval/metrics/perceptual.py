@@ -59,21 +59,22 @@ class LPIPS:
         lpips.require_size(self.net, *imagined.shape[2:4])
         return _distances(self.net, self.params, imagined, truth)
 
-    def towards(self, truth_BTHWC: Array) -> Callable[[Array], Array]:
+    def in_masks(self, imagined_BTHWC: Array, truth_BTHWC: Array, masks_BTKHW: Array) -> Array:
+        """Return the sums over the pixels of K masks of every frame, (B, T, K).
+
+        Divided by the pixels of its mask, a sum is the distance within the mask; see
+        ``lpips.sums_in_masks``. Errors are those of ``frames``.
+        """
+        return self.towards(truth_BTHWC).in_masks(imagined_BTHWC, masks_BTKHW)
+
+    def towards(self, truth_BTHWC: Array) -> Towards:
         """Return ``frames`` with a fixed ground truth, which passes through the network only once.
 
         ``imagined_BTHWC -> distances (B, T)`` raises the same errors as ``frames``.
         """
         made = jax.eval_shape(self.described, truth_BTHWC)
-        if sum(x.size * x.dtype.itemsize for x in made) > KEPT:
-            return lambda imagined_BTHWC: self.frames(imagined_BTHWC, truth_BTHWC)
-        described = self.described(truth_BTHWC)
-
-        def to(imagined_BTHWC: Array) -> Array:
-            imagined, _ = colours(imagined_BTHWC, truth_BTHWC)
-            return _distances_to_features(self.net, self.params, imagined, described)
-
-        return to
+        large = sum(x.size * x.dtype.itemsize for x in made) > KEPT
+        return Towards(self, truth_BTHWC, None if large else self.described(truth_BTHWC))
 
     def described(self, truth_BTHWC: Array) -> tuple[Array, ...]:
         """Return ``lpips.describe`` of all images of clips."""
@@ -86,8 +87,34 @@ class LPIPS:
         """Return a description for the protocol."""
         return (
             f"version 0.1 with {NAMES[self.net]}, of colours in [−1, 1], whole images, not "
-            "resized, averaged over a clip's frames; lower is better"
+            "resized, averaged over a clip's frames; over pixels seen before or never seen, the "
+            "mean of its map over them; lower is better"
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class Towards:
+    """LPIPS with a fixed ground truth; ``described`` are its features, None if they are large."""
+
+    metric: LPIPS
+    truth_BTHWC: Array = dataclasses.field(repr=False)
+    described: tuple[Array, ...] | None = dataclasses.field(repr=False)
+
+    def __call__(self, imagined_BTHWC: Array) -> Array:
+        """Return ``LPIPS.frames``."""
+        if self.described is None:
+            return self.metric.frames(imagined_BTHWC, self.truth_BTHWC)
+        imagined, _ = colours(imagined_BTHWC, self.truth_BTHWC)
+        return _distances_to_features(self.metric.net, self.metric.params, imagined, self.described)
+
+    def in_masks(self, imagined_BTHWC: Array, masks_BTKHW: Array) -> Array:
+        """Return ``LPIPS.in_masks``."""
+        imagined, truth = colours(imagined_BTHWC, self.truth_BTHWC)
+        net, params = self.metric.net, self.metric.params
+        lpips.require_size(net, *imagined.shape[2:4])
+        if self.described is None:
+            return _sums_in_masks(net, params, imagined, truth, masks_BTKHW)
+        return _sums_to_features(net, params, imagined, self.described, masks_BTKHW)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -122,6 +149,39 @@ def _distances_to_features(
         return lpips.distance(params, mine, [x[None] for x in pair[1]])[0]
 
     return _map_images(one, (_signals(imagined_BTHWC), truth)).reshape(imagined_BTHWC.shape[:2])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _sums_to_features(
+    net: Net, params: Params, imagined_BTHWC: Array, truth: tuple[Array, ...], masks_BTKHW: Array
+) -> Array:
+    """Sum the map of distances from precomputed features under masks."""
+
+    def one(parts: tuple[Array, tuple[Array, ...], Array]) -> Array:
+        picture, described, masks_KHW = parts
+        mine = lpips.describe(net, params, picture[None])
+        given = mine, [x[None] for x in described], masks_KHW[None]
+        return lpips.sums_in_masks(params, *given)[0]
+
+    masks = masks_BTKHW.reshape(-1, *masks_BTKHW.shape[2:])
+    found = _map_images(one, (_signals(imagined_BTHWC), truth, masks))
+    return found.reshape(masks_BTKHW.shape[:3])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _sums_in_masks(
+    net: Net, params: Params, imagined_BTHWC: Array, truth_BTHWC: Array, masks_BTKHW: Array
+) -> Array:
+    """Sum the map of distances of colours in [0, 1] under masks, frame by frame."""
+
+    def one(parts: tuple[Array, Array, Array]) -> Array:
+        *pictures, masks_KHW = parts
+        both = (lpips.describe(net, params, picture[None]) for picture in pictures)
+        return lpips.sums_in_masks(params, *both, masks_KHW[None])[0]
+
+    masks = masks_BTKHW.reshape(-1, *masks_BTKHW.shape[2:])
+    found = _map_images(one, (_signals(imagined_BTHWC), _signals(truth_BTHWC), masks))
+    return found.reshape(masks_BTKHW.shape[:3])
 
 
 def _signals(clips_BTHWC: Array) -> Array:

@@ -248,7 +248,8 @@ class VideoDistance:
         }[self.kind]
         return (
             f"{how} between the 400 logits of I3D (Kinetics-400, colours), averaged over time, of "
-            "clips resized to 224 × 224 (linear, antialiased); lower is better"
+            "clips resized to 224 × 224 (linear, antialiased); over pixels "
+            "seen before or never seen, of clips that show the truth elsewhere; lower is better"
         )
 
 

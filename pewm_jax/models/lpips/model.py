@@ -10,7 +10,7 @@ reference is ``lpips/lpips.py`` and ``pretrained_networks.py`` of richzhang/Perc
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import jax
@@ -132,11 +132,55 @@ def describe(net: Net, params: Params, x_NHWC: Array) -> tuple[Array, ...]:
 def distance(params: Params, a: Sequence[Array], b: Sequence[Array]) -> Array:
     """Return the distances of described pictures, (N,); one of the two may have a batch of 1."""
     total = jnp.zeros(())
-    for k, (one, other) in enumerate(zip(a, b, strict=True)):
-        weights_C = params["lin"][f"layer_{k}"].astype(jnp.float32)
-        apart = (jnp.square(one - other) * weights_C).sum(-1)
+    for apart in _maps(params, a, b):
         total = total + apart.mean((1, 2))
     return total
+
+
+def sums_in_masks(
+    params: Params, a: Sequence[Array], b: Sequence[Array], masks_NKHW: Array
+) -> Array:
+    """Return the sums, over the pixels of masks, of the map of distances of described pictures.
+
+    The map is the sum of the layers' distances, each enlarged to the picture: a position of a layer
+    covers an equal part of it, h × w positions H/h × W/w pixels each. So the mean over all pixels
+    is ``distance``, and a sum divided by the mask's pixels is the distance within the mask. The
+    features of a position see pixels outside the mask, too.
+
+    Args:
+        params: the network's parameters.
+        a: descriptions of N pictures; see ``describe``.
+        b: of N or of 1.
+        masks_NKHW: K masks of each picture, bool or numbers.
+
+    Returns:
+        (N, K) float32.
+    """
+    masks = masks_NKHW.astype(jnp.float32)
+    total = jnp.zeros(masks.shape[:2])
+    for apart in _maps(params, a, b):
+        rows, columns = (
+            jnp.asarray(_shares(few, many))
+            for few, many in zip(apart.shape[1:], masks.shape[2:], strict=True)
+        )
+        parts = (rows, masks, columns, apart)
+        total = total + jnp.einsum("hH,nkHW,wW,nhw->nk", *parts, precision="highest")
+    return total
+
+
+def _maps(params: Params, a: Sequence[Array], b: Sequence[Array]) -> Iterator[Array]:
+    """Yield the distances of each layer's positions, (N, h, w)."""
+    for k, (one, other) in enumerate(zip(a, b, strict=True)):
+        weights_C = params["lin"][f"layer_{k}"].astype(jnp.float32)
+        yield (jnp.square(one - other) * weights_C).sum(-1)
+
+
+def _shares(few: int, many: int) -> np.ndarray:
+    """Return which share of each of ``many`` pixels lies in each of ``few`` equal parts of them."""
+    ends = np.arange(few + 1) * (many / few)
+    pixels = np.arange(many)
+    left = np.maximum(ends[:-1, None], pixels)
+    return np.maximum(np.minimum(ends[1:, None], pixels + 1) - left, 0).astype(np.float32)
 
 
 def require_size(net: Net, height: int, width: int) -> None:

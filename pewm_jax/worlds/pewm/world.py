@@ -6,7 +6,8 @@ cameras. Imagined frames are inserted as observed ones are, with ``observed=Fals
 Stage ``gate`` fine-tunes the codec's gate, which blends imagined frames with the rendered memory.
 The codec trains it on true latents with noise, but the errors of imagined frames differ: they are
 sharp, plausible and displaced. So the model imagines each clip once, from the clip's first frame
-and with the memory of its context, and only the gate is trained to choose at each pixel.
+and with the memory of its context, and only the gate is trained to choose at each pixel. Stage
+``sharpen`` trains it further on such clips, with LPIPS and a discriminator (``worlds.sharpen``).
 """
 
 from __future__ import annotations
@@ -25,11 +26,17 @@ from pewm_jax.config.assembled import WhereObserved
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params, View, WorldState
-from pewm_jax.worlds import checks, objective, perturbation, world_model
-from pewm_jax.worlds import codec as codec_task
+from pewm_jax.worlds import (
+    checks,
+    codec_losses,
+    objective,
+    perturbation,
+    sharpen,
+    world_model,
+)
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.pewm import candidates
-from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
+from pewm_jax.worlds.stages import ADVERSARY, FREEZE, TRAIN, Stage
 
 
 def require_gate(model: AssembledModel) -> None:
@@ -70,10 +77,28 @@ def prepare_gate(model: AssembledModel, params: Params, clip: Clip) -> Clip:
 def gate_loss(
     model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
 ) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of the gate on imagined frames; see ``codec_task.score``.
+    """Return the loss of the gate on imagined frames; see ``codec_losses.score``."""
+    assert isinstance(train, TrainConfig)
+    perceptual = (train.gate_lpips, params["lpips"]) if train.gate_lpips else None
+    given = _gate_inputs(model, train, params, clip, key)
+    return codec_losses.score(model, params["codec"]["gate"], *given, perceptual)
 
-    With ``train.memory_errors`` the gate also gets renderings with errors. The frames were imagined
-    without these, so the gate can learn to prefer them there.
+
+def sharpen_loss(
+    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, dict[str, Array]]:
+    """Return the loss that sharpens the gate; see ``codec_losses.sharpen_gate``."""
+    given = _gate_inputs(model, train, params, clip, key)
+    return codec_losses.sharpen_gate(model, train, params, *given)
+
+
+def _gate_inputs(
+    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
+) -> tuple[Array, Array, Array, Array, Frames]:
+    """Return imagined colours and depth, the rendered memory, its mask, and the true frames.
+
+    With ``train.memory_errors`` the rendering has errors. The frames were imagined without these,
+    so the gate can learn to prefer them there.
     """
     assert isinstance(train, TrainConfig)
     if "latents_thwC" not in clip.extras:
@@ -87,24 +112,19 @@ def gate_loss(
     rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
     shown = rgbd_signal(model.clip, view.features_THWF[..., :3], view.depth_THW)
     truth = jax.tree.map(lambda x: x[:, 1:], as_signal(clip.frames))
-    return codec_task.score(
-        model,
-        params["codec"]["gate"],
-        rgb[:, 1:],
-        depth[:, 1:],
-        shown[:, 1:],
-        view.seen_THW[:, 1:],
-        truth,
-        (train.gate_lpips, params["lpips"]) if train.gate_lpips else None,
-    )
+    return rgb[:, 1:], depth[:, 1:], shown[:, 1:], view.seen_THW[:, 1:], truth
 
 
-def gate_perceptual(model: AssembledModel, train: TrainSettings) -> Params | None:
-    """Return the weights that ``gate_loss`` needs, or None; see ``codec_task.lpips_weights``."""
-    assert isinstance(train, TrainConfig)
-    if not train.gate_lpips:
+def gate_perceptual(
+    model: AssembledModel, train: TrainSettings, weight: str = "gate_lpips"
+) -> Params | None:
+    """Return the weights that a loss with this weight of LPIPS needs, or None.
+
+    See ``codec_losses.lpips_weights``.
+    """
+    if not getattr(train, weight):
         return None
-    return codec_task.lpips_weights(codec_task.LPIPS, model.clip)
+    return codec_losses.lpips_weights(codec_losses.LPIPS, model.clip)
 
 
 FROZEN = r"(codec|encoder|image|text)/.*"
@@ -148,6 +168,29 @@ GATE = Stage(
     extra_weights=gate_perceptual,
     require=require_gate,
 )
+
+
+def _with_discriminator(model: AssembledModel, key: Array) -> Params:
+    """Return random parameters of all parts, and of the discriminator."""
+    return {**world_model.init(model, key), **sharpen.init(key)}
+
+
+def _require_sharpen(model: AssembledModel) -> None:
+    """Refuse a model without a gate, or with frames that are too small."""
+    require_gate(model)
+    sharpen.require_size(model.clip.height, model.clip.width)
+
+
+SHARPEN = dataclasses.replace(
+    GATE,
+    name="sharpen",
+    number=5,
+    rules=((sharpen.DISCRIMINATOR, ADVERSARY), *GATE.rules),
+    init=_with_discriminator,
+    loss=sharpen_loss,
+    extra_weights=functools.partial(gate_perceptual, weight="sharpen_lpips"),
+    require=_require_sharpen,
+)
 STAGES = (STAGE_1, STAGE_2, JOINT, GATE)
 """Stage 1 adapts the backbone to the domain, the control and RGB-D, without memory. Stage 2 adds
 the memory reader, which has no effect at first, and trains only the reader. ``joint`` trains both,
@@ -171,11 +214,19 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         return world_model.init(self, key)
 
     def stages(self) -> tuple[Stage, ...]:
-        """Return the paper's two stages and two optional ones, with the control's learning rate."""
+        """Return the paper's two stages and optional ones, with the control's learning rate.
+
+        A model with a gate has one more, which sharpens it.
+        """
+        stages = (*STAGES, SHARPEN) if memories.gated(self) else STAGES
         if self.control.rate == 1:
-            return STAGES
+            return stages
         rates = ((r"control/.*", self.control.rate),)
-        return tuple(dataclasses.replace(stage, rates=rates) for stage in STAGES)
+        return tuple(dataclasses.replace(stage, rates=rates) for stage in stages)
+
+    def sharding(self) -> tuple[tuple[str, Any], ...]:
+        """Return the rules of all parts, and of the discriminator."""
+        return (*super().sharding(), *sharpen.SHARDING)
 
     def start(self, params: Params, frames: Frames) -> WorldState:
         """Begin a world; see ``worlds.start``."""

@@ -11,7 +11,7 @@ from pewm_jax.config import UserError
 from pewm_jax.eval import metrics
 from pewm_jax.eval.metrics import perceptual
 from pewm_jax.eval.metrics.images import MASKS, SUMS, with_lpips
-from pewm_jax.eval.statistics import margins, per_frame, table
+from pewm_jax.eval.statistics import margins, per_frame, scores, table
 from pewm_jax.io import weights
 from pewm_jax.models.lpips import convert as lpips_weights
 from pewm_jax.models.lpips import model as lpips
@@ -230,3 +230,79 @@ def test_tables_have_lpips_of_whole_pictures_and_only_where_it_was_measured():
         "LPIPS[alex] of whole images, lower is better: with its map 0.250 ± 0.000"
     )
     assert "same weights, empty map 0.350" in said
+    assert "never seen" not in said
+
+
+def distance(files, name="lpips_alex"):
+    return metrics.load(name, files[name])
+
+
+def test_a_mask_of_all_pixels_gives_the_whole_picture(files):
+    lpips_alex, truth = distance(files), clips()
+    imagined = noisy(truth, 4)
+    everything = np.ones((*truth.shape[:2], 1, *truth.shape[2:4]), bool)
+    whole = lpips_alex.frames(imagined, truth)
+    within = lpips_alex.in_masks(imagined, truth, everything)[..., 0] / everything[0, 0].sum()
+    np.testing.assert_allclose(within, whole, rtol=1e-5)
+    halves = np.zeros((*truth.shape[:2], 2, *truth.shape[2:4]), bool)
+    halves[:, :, 0, :17], halves[:, :, 1, 17:] = True, True
+    sums = lpips_alex.in_masks(imagined, truth, halves).sum(-1)
+    np.testing.assert_allclose(sums / everything[0, 0].sum(), whole, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kept", [perceptual.KEPT, 0])
+def test_a_ground_truth_described_once_gives_the_same_sums(kept, files, monkeypatch):
+    monkeypatch.setattr(perceptual, "KEPT", kept)
+    lpips_alex, truth = distance(files), clips(2)
+    imagined, masks = noisy(truth, 4), np.random.default_rng(2).random((2, 2, 3, 40, 33)) < 0.3
+    to = lpips_alex.towards(truth)
+    assert (to.described is None) == (kept == 0)
+    np.testing.assert_allclose(
+        to.in_masks(imagined, masks), lpips_alex.in_masks(imagined, truth, masks), rtol=1e-6
+    )
+    np.testing.assert_allclose(to(imagined), lpips_alex.frames(imagined, truth), rtol=1e-6)
+    assert (to.in_masks(truth, masks) == 0).all()
+
+
+def test_a_change_counts_where_it_is_and_not_far_away(files):
+    lpips_alex = distance(files)
+    truth = clips(1, 1, (40, 512))
+    changed = truth.copy()
+    changed[..., :40, :] *= -1
+    masks = np.zeros((1, 1, 3, 40, 512), bool)
+    masks[:, :, 0, :, :40] = True  # where the change is
+    masks[:, :, 1, :, 40:] = True  # everywhere else
+    masks[:, :, 2, :, 300:] = True  # further than the network sees
+    here, near, far = lpips_alex.in_masks(changed, truth, masks)[0, 0] / masks.sum((0, 1, 3, 4))
+    assert here > 5 * near > 0
+    assert far == 0
+
+
+def test_frames_weigh_as_many_pixels_as_a_mask_has(files):
+    lpips_alex, truth = distance(files), clips(2, 3)
+    imagined = noisy(truth, 4)
+    seen = np.zeros(truth.shape[:4], bool)
+    seen[:, 0, :30], seen[:, 1, :10] = True, True  # and nothing in the third frame
+    pair = np.stack([seen, ~seen], 2)
+    sums = np.zeros((2, 3, len(MASKS), len(SUMS)))
+    for k, mask in enumerate((seen, ~seen, np.ones_like(seen))):
+        sums[..., k, SUMS.index("colours")] = 3 * mask.sum((2, 3))
+    in_masks = np.asarray(lpips_alex.in_masks(imagined, truth, pair))
+    whole = np.asarray(lpips_alex.frames(imagined, truth))
+    sums = with_lpips(sums, whole, in_masks)
+    found = scores(sums.sum(1))
+    np.testing.assert_allclose(found["all"]["lpips"], whole.mean(1), rtol=1e-6)
+    pixels = seen.sum((2, 3))
+    for clip in range(2):
+        each = in_masks[clip, :2, 0] / pixels[clip, :2]
+        wanted = np.average(each, weights=pixels[clip, :2])
+        assert found["seen"]["lpips"][clip] == pytest.approx(wanted, rel=1e-6)
+    frames = scores(sums)
+    assert np.isnan(frames["seen"]["lpips"][:, 2]).all()
+    assert np.isfinite(frames["unseen"]["lpips"]).all()
+    both = {"memory": sums[None], "copy": sums[None]}
+    results = table(both, np.arange(2))
+    said = format_lpips({"results": results, "protocol": {"lpips_name": "LPIPS[alex]"}})
+    assert "Over pixels seen before: with its map" in said
+    assert "Over pixels never seen: with its map" in said
+    assert "lpips" in margins(both, np.arange(2))["copy"]["unseen"]
