@@ -17,12 +17,15 @@ import hmac
 import os
 import secrets
 import stat
+import time
 from pathlib import Path
 
 from pewm_jax.io import atomic
 
 SUFFIX = ".seal"
 KEY_BYTES = 32
+NEW_S = 2.0
+"""Seconds within which a process seals a file that it has written."""
 PRIVATE, PRIVATE_FILE = 0o700, 0o600
 
 
@@ -50,7 +53,10 @@ class Seals:
         Links are removed and not followed. Seals without a file are removed, too.
         """
         removed = 0
-        for path in self._files():
+        files = self._files()
+        if any(_is_new(path) and not self._is_sealed(path) for path in files):
+            time.sleep(NEW_S)  # another process of this user may be about to seal it
+        for path in files:
             if self._is_sealed(path):
                 self._known.add(path.name)
                 continue
@@ -92,6 +98,13 @@ class Seals:
         code = hmac.new(self._key, path.name.encode() + b"\0", hashlib.sha256)
         code.update(path.read_bytes())
         return code.hexdigest()
+
+
+def _is_new(path: Path) -> bool:
+    try:
+        return abs(time.time() - path.lstat().st_mtime) < NEW_S
+    except OSError:
+        return False
 
 
 def _seal_of(path: Path) -> Path:

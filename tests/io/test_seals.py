@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr(seals, "NEW_S", 0.0)
     made = tmp_path / "cache"
     one = Seals(made, "-cache", seals.read_key())
     (made / "a-cache").write_bytes(b"program a")
@@ -67,6 +68,15 @@ def test_other_files_are_removed(folder, how, tmp_path):
     assert sorted(path.name for path in folder.glob("*.seal")) == ["b-cache.seal"]
     if how == "link":
         assert (tmp_path / "elsewhere").exists()
+
+
+def test_a_file_that_another_process_is_about_to_seal_stays(folder, monkeypatch):
+    other = opened(folder)
+    (folder / "c-cache").write_bytes(b"program c")
+    monkeypatch.setattr(seals, "NEW_S", 0.5)
+    monkeypatch.setattr(seals.time, "sleep", lambda _: other.add_new())
+    assert opened(folder).remove_foreign() == 0
+    assert names(folder) == ["a-cache", "b-cache", "c-cache"]
 
 
 def test_files_of_another_user_s_key_are_removed(folder, tmp_path, monkeypatch):
