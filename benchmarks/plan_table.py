@@ -158,6 +158,9 @@ def arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--only", choices=tuple(CHIPS), help="one of the tables")
     parser.add_argument("--presets", nargs="+", default=PRESETS)
     parser.add_argument("--chips", nargs="+", default=())
+    parser.add_argument(
+        "--names", nargs="+", default=(), help="stages or programs, such as clip-50"
+    )
     parser.add_argument("--devices", type=int, default=DEVICES, help="devices of a training")
     parser.add_argument("--folder", type=Path, default=Path("runs/plan-table"))
     parser.add_argument("--kept", action="store_true", help="compile nothing")
@@ -171,7 +174,9 @@ def main(argv: Sequence[str]) -> None:
     options = arguments(argv)
     cache = ResultCache(options.folder, TABLE)
     for which in (options.only,) if options.only else CHIPS:
-        asked = list(pieces(which, options))
+        asked = [
+            one for one in pieces(which, options) if one.name in (options.names or (one.name,))
+        ]
         for chip in {piece.chip for piece in asked}:
             topology.require_compiler(chip)
         if options.kept:

@@ -29,9 +29,6 @@ from pewm_jax.worlds.stages import Stage
 
 REMAT = "remat"
 """Name of the setting of a network that recomputes activations in the backward pass."""
-SLACK = 1.3
-"""A combination is compiled in order of its time if its estimated memory is at most this share of
-the capacity: the estimates are rough."""
 ENOUGH = 2
 """Number of fitting combinations after which the search ends."""
 GIB = 2**30
@@ -192,7 +189,8 @@ def choices(config: Config, stage: Stage, devices: int) -> Iterator[Choice]:
     """Yield all combinations; each device has at least one clip of a micro-batch."""
     remats: Sequence[bool | None] = (False, True) if remat_settings(config.model) else (None,)
     batch, context = stage.settings(config).batch, config.train.mesh.context
-    for mesh in suggest.arrangements(config, stage, devices, context):
+    whole = Choice(None, 1, MeshSizes()).apply(config, stage)
+    for mesh in suggest.arrangements(whole, stage, devices, context):
         clips = batch // mesh.batch
         divisors = [2**k for k in range(clips.bit_length()) if clips % 2**k == 0]
         for remat, parts in itertools.product(remats, divisors):
@@ -217,13 +215,16 @@ class Estimates:
         job = Job(changed, self.stage, self.chip, self.work(choice.remat))
         return Estimate(state + factor * temporary, job.predict(choice.mesh).step_s)
 
-    def order(self, choice: Choice) -> tuple[bool, float, float]:
-        """Return a key that sorts the most promising first."""
+    def order(self, choice: Choice) -> tuple[bool, float, int, float]:
+        """Return a key that sorts the most promising first: those that may fit, by their time.
+
+        Times that agree to two digits count as equal: then fewer micro-batches come first, whose
+        products are larger, and then less memory.
+        """
         found = self(choice)
-        hopeless = found.peak_bytes > SLACK * self.capacity
-        # Times that agree to two digits count as equal: then the smaller one is first.
-        seconds = found.peak_bytes if hopeless else float(f"{found.step_s:.2g}")
-        return hopeless, seconds, found.peak_bytes
+        too_large = found.peak_bytes > self.capacity
+        cost = found.peak_bytes if too_large else float(f"{found.step_s:.2g}")
+        return too_large, cost, choice.micro_batches, found.peak_bytes
 
     def correct(self, choice: Choice, report: StageReport) -> None:
         """Scale the temporary memory of combinations like one by what its compiler measured."""

@@ -240,6 +240,7 @@ class Job:
         products_s = sum(flops / (peak * REACHED[kind]) for kind, flops in done.items())
         streamed = self.work.traffic_on_device(mesh)
         streamed += OPTIMIZER * FLOAT * counts(self.config, self.stage)["trained"].on(mesh)
+        streamed += self._streamed_again(mesh)
         streaming_s = streamed / (self.chip.bandwidth * STREAMED)
         sent = self.traffic(mesh)
         seconds = {key: size / self._rate(mesh, key[1]) for key, size in sent.items()}
@@ -259,6 +260,15 @@ class Job:
             mfu=self.work.needed.total / (step_s * self.chip.flops * mesh.devices),
             clips_per_s=clips / step_s,
         )
+
+    def _streamed_again(self, mesh: MeshSizes) -> float:
+        """Return the bytes of weights and sums of gradients that further micro-batches stream."""
+        c = counts(self.config, self.stage)
+        parts = self.stage.settings(self.config).micro_batches
+        wide = 2 if self.config.model.dtype == "bfloat16" else FLOAT
+        weights = (c["trained"].on(mesh) + c["frozen"].on(mesh)) * mesh.fsdp * wide
+        passes = 2 + self.work.recomputes
+        return (parts - 1) * (passes * weights + 3 * FLOAT * c["trained"].on(mesh))
 
     def traffic(self, mesh: MeshSizes) -> dict[tuple[str, str], float]:
         """Return the bytes that a device sends in a step, by kind and axis of the mesh.

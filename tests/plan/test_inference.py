@@ -105,9 +105,8 @@ def test_a_tiny_clip_is_compiled_for_a_chip_that_is_not_there(chip):
     assert (found.name, found.devices) == ("clip-4", 1)
     assert found.fits
     assert found.fits_gb == {"16": True, "24": True, "80": True}
-    assert found.argument_bytes == pytest.approx(
-        inference.program(config, "clip-4").argument_bytes, rel=0.1
-    )
+    # A TPU pads small arrays.
+    assert found.argument_bytes >= 0.99 * inference.program(config, "clip-4").argument_bytes
     assert found.flops_executed >= 0.99 * found.flops_needed > 0
     assert found.roofline_s > 0
     assert dataclasses.asdict(found)["collectives"] == []
