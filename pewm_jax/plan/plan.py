@@ -156,8 +156,8 @@ def _fit_on_target(
     best = found.best.report
     assert best is not None
     best = dataclasses.replace(best, tries=[one.summary for one in found.tries])
-    told = report_lines(best, stage.title, stage.settings(config).batch)
-    return best, itertools.chain(told, fit.lines(found))
+    printed = report_lines(best, stage.title, stage.settings(config).batch)
+    return best, itertools.chain(printed, fit.lines(found))
 
 
 def _require_writable(file: Path) -> None:
