@@ -11,12 +11,13 @@ BENCH ?= render cogvideox memory dinov2 training
 NEWEST = tests/models/*/test_parity*.py tests/diffusion tests/train/test_sharding.py \
   tests/train/test_loop.py tests/train/test_two_stages.py tests/cli/test_train.py
 
-.PHONY: help demo table1 table2 test test-all test-newest docs lint format bench clean
+.PHONY: help demo table1 table2 plan-table test test-all test-newest docs lint format bench clean
 
 help:
 	@echo "make demo         collect, train, imagine and evaluate; prints the path of the report"
 	@echo "make table1       train and evaluate every memory (hours; resumes if interrupted)"
 	@echo "make table2       evaluate policies, rankings and plans (hours; resumes if interrupted)"
+	@echo "make plan-table   compile every preset for absent chips (hours; resumes if interrupted)"
 	@echo "make test         the tests, without those marked slow"
 	@echo "make test-all     all tests"
 	@echo "make test-newest  a part of the tests on the newest installed Python with the newest JAX"
@@ -62,10 +63,14 @@ test: .venv/installed-dev
 	@PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
 	  -m "not slow" --hypothesis-profile quick $(ARGS)
 
-# The compilers of TPUs and NVIDIA GPUs, without which two tests are skipped; 2 GB.
+# The compilers of TPUs and NVIDIA GPUs, without which a few tests are skipped; 2 GB.
 .venv/installed-plan: .venv/installed-dev
 	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[plan-tpu,plan-cuda]'
 	@touch $@
+
+# ARGS="--only training --chips h100 --presets pewm_2b" compiles a part; --record rewrites the page.
+plan-table: .venv/installed-plan
+	@$(PY) benchmarks/plan_table.py $(ARGS)
 
 test-all: .venv/installed-plan
 	@JAX_PLATFORMS=cpu PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

@@ -6,8 +6,9 @@ its own, and its numbers are kept in ``--state``: after an interruption, or the 
 command, run the same command again and it goes on. ``--record`` writes the section of RESULTS.md.
 ``--smoke`` shows on a CPU, with absurdly small networks, that the parts run.
 
-MFU is against the measured rate of a large bf16 matrix product. FLOPs are those of the matrix
-products; a train step counts three forwards.
+"plan" is what the compiler says of our programs: their memory, and a lower bound of their time from
+the data sheet. MFU is against the measured rate of a large bf16 matrix product. FLOPs are those of
+the matrix products; a train step counts three forwards.
 """
 
 from __future__ import annotations
@@ -38,11 +39,14 @@ from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.vae import VAECodec
+from pewm_jax.plan import measure, program
+from pewm_jax.train import chips
 
 NAME = "cogvideox_gpu"
 OURS = ("ceiling", "forward", "train", "clip", "decode")
 PEER = ("forward", "train", "clip", "decode")
-HEADER = ("", "ms", "TFLOP/s", "MFU", "peak memory, GB", "compile, s", "batch")
+HEADER = ("", "ms", "plan: at best", "TFLOP/s", "MFU", "peak memory, GB", "plan", "compile, s")
+HEADER += ("batch",)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +124,18 @@ def timed(job: Callable[[], Any], repeats: int) -> dict[str, float]:
     return {"ms": statistics.median(seconds) * 1e3, "compile_s": first}
 
 
+def planned(run: Any, *arguments: Any, flops: float = 0.0) -> dict[str, float]:
+    """Return the memory of a compiled program, and a lower bound of its time on a known chip."""
+    compiled = run.lower(*arguments).compile()  # by now it is compiled, and kept by JAX
+    found = {"plan_gb": sum(measure.device_memory(compiled)) / 1e9}
+    chip = chips.find(jax.local_devices()[0].device_kind)
+    if chip is not None:
+        work = program.read(compiled.as_text(), for_chip=True)
+        seconds = max(flops, work.flops) / chip.flops, work.bytes / chip.bandwidth
+        found["plan_ms"] = max(seconds) * 1e3
+    return found
+
+
 def draw(shapes: Any, dtype: Any) -> Any:
     """Return random parameters of these shapes, the same million numbers again and again."""
     numbers = 0.02 * np.random.default_rng(0).normal(size=2**20).astype(np.float32)
@@ -153,7 +169,9 @@ def measure_forward(setting: Setting) -> dict[str, float]:
     params = backbone(setting, setting.dtype)
     run = jax.jit(lambda p, x, y: dit.apply(setting.dit, p, x, y, jnp.full(x.shape[0], 500)))
     found = timed(lambda: run(params, latents, text), setting.repeats)
-    return {**found, "flops": setting.batch * setting.flops, "batch": setting.batch}
+    flops = setting.batch * setting.flops
+    found |= planned(run, params, latents, text, flops=flops)
+    return {**found, "flops": flops, "batch": setting.batch}
 
 
 def measure_train(setting: Setting) -> dict[str, float]:
@@ -181,7 +199,9 @@ def measure_train(setting: Setting) -> dict[str, float]:
         return held[0][0]["proj_out"]["bias"]
 
     flops = 3 * setting.batch * setting.flops
-    return {**timed(job, setting.repeats), "flops": flops, "batch": setting.batch}
+    found = timed(job, setting.repeats)
+    found |= planned(jitted, held[0], flops=flops)
+    return {**found, "flops": flops, "batch": setting.batch}
 
 
 def autoencoder(setting: Setting) -> Any:
@@ -208,8 +228,10 @@ def measure_clip(setting: Setting) -> dict[str, float]:
         return vae.decode(setting.vae, codec, x0.astype(setting.dtype))
 
     run = jax.jit(clip)
-    found = timed(lambda: run(params, codec, frame, noise, text), max(1, setting.repeats // 3))
-    return {**found, "flops": setting.steps * setting.flops, "batch": 1}
+    given, flops = (params, codec, frame, noise, text), setting.steps * setting.flops
+    found = timed(lambda: run(*given), max(1, setting.repeats // 3))
+    found |= planned(run, *given, flops=flops)
+    return {**found, "flops": flops, "batch": 1}
 
 
 def measure_decode(setting: Setting) -> dict[str, float]:
@@ -217,7 +239,8 @@ def measure_decode(setting: Setting) -> dict[str, float]:
     latents, _ = inputs(setting, 1)
     codec = autoencoder(setting)
     run = jax.jit(lambda p, x: vae.decode(setting.vae, p, x))
-    return {**timed(lambda: run(codec, latents), setting.repeats), "batch": 1}
+    found = timed(lambda: run(codec, latents), setting.repeats)
+    return {**found, **planned(run, codec, latents), "batch": 1}
 
 
 MEASURES = {
@@ -248,9 +271,10 @@ def report(done: dict[str, dict[str, float]]) -> str:
     for name, found in done.items():
         rate = found.get("flops", 0.0) / found["ms"] / 1e9
         share = f"{rate / best:.0%}" if best and rate else ""
-        cells = (name, f"{found['ms']:.1f}", f"{rate:.1f}" if rate else "", share)
+        best, plan_gb = (f"{found[k]:.1f}" if k in found else "" for k in ("plan_ms", "plan_gb"))
+        cells = (name, f"{found['ms']:.1f}", best, f"{rate:.1f}" if rate else "", share)
         memory, compiling = (f"{found.get(k, 0):.1f}" for k in ("peak_gb", "compile_s"))
-        rows.append((*cells, memory, compiling, f"{found.get('batch', 1):.0f}"))
+        rows.append((*cells, memory, plan_gb, compiling, f"{found.get('batch', 1):.0f}"))
     return record.table(HEADER, rows)
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from pewm_jax.errors import ConfigError, UserError
     from pewm_jax.geometry.actions import integrate
     from pewm_jax.geometry.cameras import intrinsics_from_fov, pose_from_yaw
+    from pewm_jax.io.runtime import cache_compilation
     from pewm_jax.train.loading import load
     from pewm_jax.types import Camera, Clip, Control, Frames, VoxelMap, WorldState
     from pewm_jax.worlds import imagine, imagine_many, observe, start
@@ -43,6 +44,7 @@ _HOME = {
     "UserError": "errors",
     "VoxelMap": "types",
     "WorldState": "types",
+    "cache_compilation": "io.runtime",
     "integrate": "geometry.actions",
     "imagine": "worlds",
     "imagine_many": "worlds",
@@ -66,6 +68,7 @@ __all__ = [
     "UserError",
     "VoxelMap",
     "WorldState",
+    "cache_compilation",
     "imagine",
     "imagine_many",
     "integrate",

@@ -40,6 +40,9 @@ if next(iter(QUICK)) not in given:  # workers inherit them, as do the programs t
     quick = (f"--{flag}={value}" for flag, value in known(QUICK).items())
     os.environ["XLA_FLAGS"] = " ".join([given, *quick]).strip()
 
+# The key of compiled programs is not the user's own.
+os.environ["XDG_STATE_HOME"] = str(Path(tempfile.gettempdir()) / f"pewm-jax-tests-{os.getuid()}")
+
 # A shell that starts the tests in the background tells them to ignore Ctrl-C, and so would every
 # program that they start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -72,6 +72,14 @@ class Launch(Join):
     compiler: str = "cpu"
     """Of a plan: `target` compiles the step with the chip's own compiler, which needs the extra
     plan-tpu or plan-cuda; `cpu` compiles it for virtual CPU devices and estimates the chip's."""
+    fit: bool = False
+    """Of a plan with `--compiler target`: search rematerialization, micro-batches and the mesh for
+    the fastest settings that fit."""
+    tries: int = 4
+    """Of a plan with `--fit`: largest number of settings that are compiled for each stage."""
+    inference: bool = False
+    """Of a plan with `--compiler target`: compile what a trained model runs, on one device and with
+    weights in bfloat16, instead of the training."""
     json: str = ""
     """Of a plan: also write the numbers of every stage to this file."""
     compiled: str = "auto"
@@ -91,5 +99,15 @@ class Launch(Join):
             self.compiler in COMPILERS,
             f"--compiler is {self.compiler}: use {', '.join(COMPILERS)}.",
         )
+        for name in ("fit", "inference"):
+            require(
+                not getattr(self, name) or self.compiler == "target",
+                f"--{name} compiles for the chip: add --compiler target.",
+            )
+        require(
+            not (self.fit and self.inference),
+            "--fit searches settings of training and --inference plans none: give one of them.",
+        )
+        require(self.tries >= 1, f"--tries is {self.tries}: use at least 1.")
         require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")
         require(self.profile >= 0, f"--profile is {self.profile}: use 0 or more steps.")

@@ -102,6 +102,9 @@ class StageConfig:
     """Optimizer steps."""
     batch: int = 16
     """Clips per step."""
+    micro_batches: int = 1
+    """Parts of a batch that are computed one after the other, so that activations take less memory
+    (gradient accumulation). A step uses the mean of their losses and gradients."""
     learning_rate: float = 1e-3
     """Peak learning rate of Adam."""
     warmup: int = 50
@@ -114,6 +117,10 @@ class StageConfig:
     def __post_init__(self):
         """Validate."""
         require(self.steps >= 0 and self.batch >= 1, "steps ≥ 0 and batch ≥ 1 are needed.")
+        require(
+            self.micro_batches >= 1 and self.batch % self.micro_batches == 0,
+            f"micro_batches is {self.micro_batches}: use a divisor of the batch, {self.batch}.",
+        )
         require(self.learning_rate > 0, "learning_rate must be above 0.")
         require(self.warmup >= 0, f"warmup is {self.warmup}: use 0 (none) or more steps.")
 

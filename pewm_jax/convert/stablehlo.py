@@ -5,21 +5,28 @@
     DST/start.jaxexport       frames → the state of a world          (with what = rollout)
         rollout.jaxexport     state, actions, key → state, frames    (with what = rollout)
         denoise.jaxexport     one evaluation of the denoiser         (with what = denoise)
+        NAME.cuda.jaxexport   the same for platforms with other kernels
         weights.safetensors   the run's weights, unchanged
         signature.json        names, shapes and dtypes of all inputs and outputs
         run.py, README.md     how to call them, with jax and three small packages
 
 Weights are arguments, not constants: the programs stay small, all share one weights file, and
-weights that are trained further fit the same programs. Attention is lowered in its plain form,
-which runs on every platform; cuDNN's kernel exists on one platform and its custom calls are not
-stable. State, frames and cameras are flat named arrays, so no class of this library is needed.
+weights that are trained further fit the same programs. State, frames and cameras are flat named
+arrays, so no class of this library is needed.
+
+Kernels are chosen for each platform (``nn.target``): convolutions differ, and TPUs get splash
+attention. Platforms with the same operations share a file; another one has a file of its own, such
+as ``rollout.tpu.jaxexport``. NVIDIA GPUs get attention in its plain form: the custom calls of
+cuDNN's kernel are not stable.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -43,6 +50,7 @@ from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.io import tree
 from pewm_jax.memory import interface as memories
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.nn import target
 from pewm_jax.train import runs
 from pewm_jax.types import Array, Camera, Control, MemoryReadout, Params
 from pewm_jax.worlds import rollouts, world_model
@@ -51,6 +59,8 @@ Arrays: TypeAlias = dict[str, Array]
 """Name → array, or anything with a shape and a dtype."""
 PLATFORMS = ("cpu", "cuda", "tpu")
 """The platforms for which a program is lowered, if possible."""
+ADDRESS = re.compile(r"0x[0-9a-f]+")
+"""A place in memory in the text of a jaxpr, which differs from trace to trace."""
 SIGNATURE, SCRIPT = "signature.json", "run.py"
 TOLERANCE = {"float32": 1e-3, "bfloat16": 3e-2}
 """Largest difference from the library, relative to the largest value, by model.dtype."""
@@ -159,35 +169,61 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
     )
 
 
-def lower(program: Program, weights: Arrays, platforms: Sequence[str]) -> jax.export.Exported:
+def lower(
+    program: Program, weights: Arrays, platforms: Sequence[str]
+) -> tuple[jax.export.Exported, ...]:
     """Lower a program for every one of the platforms that supports it.
+
+    Returns:
+        One or more programs. Platforms for which the operations are the same share one.
 
     Raises:
         UserError: it cannot be lowered for any platform.
     """
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype), weights)
+    groups: dict[str, list[str]] = {}
+    for name in platforms:
+        with target.use(target.Target(name)):
+            traced = jax.jit(program.function).trace(like, program.inputs)
+        operations = ADDRESS.sub("", str(traced.jaxpr))
+        groups.setdefault(operations, []).append(name)
+    found, failed = [], ""
+    for names in groups.values():
+        exported, reason = _lower_together(program, like, names)
+        found += exported
+        failed = failed or reason
+    if not found:
+        raise UserError(
+            f"This model cannot be lowered for {', '.join(platforms)} ({failed}); choose other "
+            "platforms."
+        )
+    return tuple(found)
+
+
+def _lower_together(
+    program: Program, weights: Arrays, platforms: Sequence[str]
+) -> tuple[list[jax.export.Exported], str]:
+    """Lower a program with the same operations for those of some platforms that support it.
+
+    Returns:
+        One program, or none and the reason.
+    """
     function = jax.jit(program.function)
 
     def attempt(names: Sequence[str]) -> jax.export.Exported:
-        return jax.export.export(function, platforms=names)(like, program.inputs)
-
-    def possible(name: str) -> bool:
-        try:
-            attempt([name])
-        except (NotImplementedError, ValueError):
-            return False
-        return True
+        with target.use(target.Target(names[0])):
+            return jax.export.export(function, platforms=names)(weights, program.inputs)
 
     try:
-        return attempt(platforms)
+        return [attempt(platforms)], ""
     except (NotImplementedError, ValueError) as error:
-        names = [name for name in platforms if possible(name)]
-        if not names:
-            raise UserError(
-                f"This model cannot be lowered for {', '.join(platforms)} "
-                f"({str(error).splitlines()[0]}); choose other platforms."
-            ) from None
-        return attempt(names)
+        reason = str(error).splitlines()[0]
+    possible = []
+    for name in platforms:
+        with contextlib.suppress(NotImplementedError, ValueError):
+            attempt([name])
+            possible.append(name)
+    return ([attempt(possible)] if possible else []), reason
 
 
 def _name(**parts: Any) -> Arrays:
@@ -240,7 +276,7 @@ def export(
         config, params = rollouts.load_finished(run)
         backbone = getattr(config.model, "backbone", None)
         if isinstance(backbone, DiTBackbone):
-            anywhere = dataclasses.replace(backbone, attention="xla")
+            anywhere = dataclasses.replace(backbone, attention="auto")
             config = config.with_model(backbone=anywhere)
         if what == "rollout":
             programs = rollout_programs(config, params, frames or config.data.context, clips)
@@ -251,11 +287,13 @@ def export(
         for name, program in programs.items():
             log(f"lowering {name} for {', '.join(platforms)} …")
             exported = lower(program, weights, platforms)
-            skipped = [p for p in platforms if p not in exported.platforms]
+            entries[name] = _entry(name, program, exported)
+            skipped = [p for p in platforms if p not in entries[name]["platforms"]]
             if skipped:
                 log(f"{name} cannot be lowered for {', '.join(skipped)}: skipped.")
-            (folder / f"{name}.jaxexport").write_bytes(_serialize(exported))
-            entries[name] = _entry(name, program, exported)
+            for one in exported:
+                file = entries[name]["files"][one.platforms[0]]
+                (folder / file).write_bytes(_serialize(one))
         shutil.copyfile(run / runs.WEIGHTS, folder / runs.WEIGHTS)
         signature = {
             "made_by": f"pewm_jax {__version__}, jax {jax.__version__}",
@@ -343,13 +381,18 @@ def _serialize(exported: jax.export.Exported) -> bytes:
         ) from None
 
 
-def _entry(name: str, program: Program, exported: jax.export.Exported) -> dict[str, Any]:
-    """Describe a program for ``signature.json``."""
-    outputs = jax.tree.unflatten(exported.out_tree, exported.out_avals)
+def _entry(name: str, program: Program, exported: Sequence[jax.export.Exported]) -> dict[str, Any]:
+    """Describe a program for ``signature.json``; ``file`` is that of the first platform."""
+    first, *others = exported
+    files = dict.fromkeys(first.platforms, f"{name}.jaxexport")
+    for one in others:
+        files |= dict.fromkeys(one.platforms, f"{name}.{one.platforms[0]}.jaxexport")
+    outputs = jax.tree.unflatten(first.out_tree, first.out_avals)
     return {
         "file": f"{name}.jaxexport",
+        "files": files,
         "meaning": program.meaning,
-        "platforms": list(exported.platforms),
+        "platforms": list(files),
         "inputs": _describe_arrays(program.inputs),
         "outputs": _describe_arrays(outputs),
     }
@@ -382,10 +425,17 @@ def _check_arguments(run: Path, clips: int, frames: int | None, platforms: Seque
         )
 
 
+def _files_text(entry: dict[str, Any]) -> str:
+    """Return a program's files with their platforms."""
+    files: dict[str, list[str]] = {}
+    for platform, file in entry["files"].items():
+        files.setdefault(file, []).append(platform)
+    return ", ".join(f"`{file}` ({', '.join(names)})" for file, names in files.items())
+
+
 def _readme(name: str, signature: dict[str, Any]) -> str:
     programs = "\n".join(
-        f"- `{entry['file']}` ({', '.join(entry['platforms'])}): {entry['meaning']}."
-        for entry in signature["programs"].values()
+        f"- {_files_text(entry)}: {entry['meaning']}." for entry in signature["programs"].values()
     )
     moves = "\n".join(
         f"- {action}: `{[round(x, 4) for x in move]}`"
@@ -402,6 +452,7 @@ python run.py
 
 {programs}
 
+`run.py` takes the file of the platform of its devices.
 `signature.json` lists every input and output with shape and dtype; weights are arguments of the
 programs, in `{signature["weights"]}`. `run.py` is short and meant to be read. By hand:
 

@@ -42,7 +42,7 @@ class Model:
         self.signature = json.loads((folder / "signature.json").read_text("utf-8"))
         self.weights = load_file(folder / self.signature["weights"])
         self.programs = {
-            name: self._program(folder / entry["file"], entry)
+            name: self._program(folder / _file(name, entry), entry)
             for name, entry in self.signature["programs"].items()
         }
 
@@ -69,6 +69,15 @@ class Model:
             return call(self.weights, inputs)
 
         return program
+
+
+def _file(name, entry):
+    platform = jax.devices()[0].platform
+    platform = {"gpu": "cuda"}.get(platform, platform)
+    if platform not in entry["files"]:
+        known = ", ".join(entry["files"])
+        raise SystemExit(f"error: {name} was written for {known} and not for {platform}.")
+    return entry["files"][platform]
 
 
 def key(seed):

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.errors import UserError
-from pewm_jax.nn import placement
+from pewm_jax.nn import placement, ring_attention
 from pewm_jax.nn import target as targets
 from pewm_jax.nn.layers import linear, merge_heads, split_heads
 from pewm_jax.nn.target import Target
@@ -43,7 +43,7 @@ TOKENS = 256
 """Fewest queries and keys for which the kernel saves memory: with fewer, the logits are about as
 large as queries and keys."""
 
-Implementation = Literal["auto", "xla", "cudnn", "splash"]
+Implementation = Literal["auto", "xla", "cudnn", "splash", "ring"]
 Kernel = Literal["formula", "cudnn", "splash"]
 """What computes attention; the formula runs in blocks on a CPU."""
 
@@ -62,7 +62,8 @@ def attention(
 
     Args:
         implementation: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `splash` is flash
-            attention on TPUs, `xla` runs anywhere, `auto` takes the best that works.
+            attention on TPUs, `xla` runs anywhere, `auto` takes the best that works. `ring` splits
+            keys and values over the devices along `context`, too; on one device it is `auto`.
         real_M: indices of the keys that are not padding; None if all are real.
 
     Raises:
@@ -76,7 +77,19 @@ def attention(
 
     split: placement.Names = ("batch", "heads")
     queries: placement.Names = (*split, "tokens")
+    if implementation == "ring" and _goes_around(q_BKND, k_BKMD):
+
+        def around(q: Array, k: Array, v: Array) -> Array:
+            return ring_attention.ring(q, k, v, "context", real_M)
+
+        return placement.local(around, (queries,) * 3, queries)(q_BKND, k_BKMD, v_BKMD)
     return placement.local(alone, (queries, split, split), queries)(q_BKND, k_BKMD, v_BKMD)
+
+
+def _goes_around(q_BKND: Array, k_BKMD: Array) -> bool:
+    """Tell whether queries and keys can be split over several devices along ``context``."""
+    parts = placement.parts("tokens")
+    return parts > 1 and not q_BKND.shape[2] % parts and not k_BKMD.shape[2] % parts
 
 
 def _alone(q_BKND: Array, k_BKMD: Array, v_BKMD: Array, implementation: Implementation) -> Array:

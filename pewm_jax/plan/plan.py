@@ -11,6 +11,7 @@ a plan; then temporary memory is unknown.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +23,7 @@ import jax
 from pewm_jax import __version__
 from pewm_jax.config import Config, Launch, UserError
 from pewm_jax.io import atomic, tree
-from pewm_jax.plan import measure, suggest, target_compiler, topology
+from pewm_jax.plan import fit, inference, measure, suggest, target_compiler, topology
 from pewm_jax.plan.measure import Compiled, MeshSizes, virtual
 from pewm_jax.plan.program import COLLECTIVES
 from pewm_jax.plan.suggest import Arrangement
@@ -104,22 +105,59 @@ def show(
     chip, on_target = chips.named(launch.chip), launch.compiler == "target"
     if on_target:
         topology.require_compiler(chip)
-    sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
-    planned = runs.planned(config)
-    for stage in planned:
-        sharding.require_divisible(config, stage, sizes.abstract)
-    if not on_target:
-        virtual(launch.devices)
-    plan_one = _plan_on_target if on_target else _plan_on_cpu
+    if launch.inference:
+        found = _plan_inference(config, chip, log)
+    else:
+        found = _plan_training(config, chip, launch, log)
     plans: list[StagePlan | StageReport] = []
-    for stage in planned:
-        found, printed = plan_one(config, stage, sizes, chip, launch, log)
-        plans.append(found)
+    for plan, printed in found:
+        plans.append(plan)
         for line in printed:
             log(line)
         if file is not None:
             _write(file, plans)
     return plans
+
+
+def _plan_training(config: Config, chip: Chip, launch: Launch, log: Any) -> Iterator[Any]:
+    """Yield each stage's plan, and its lines."""
+    sizes = MeshSizes(*config.train.mesh.shape(launch.devices))
+    planned = runs.planned(config)
+    if not launch.fit:
+        for stage in planned:
+            sharding.require_divisible(config, stage, sizes.abstract)
+    if launch.compiler == "cpu":
+        virtual(launch.devices)
+    for stage in planned:
+        if launch.fit:
+            yield _fit_on_target(config, stage, chip, launch, log)
+        elif launch.compiler == "target":
+            yield _plan_on_target(config, stage, sizes, chip, launch, log)
+        else:
+            yield _plan_on_cpu(config, stage, sizes, chip, launch, log)
+
+
+def _plan_inference(
+    config: Config, chip: Chip, log: Any
+) -> Iterator[tuple[StageReport, Iterator[str]]]:
+    """Yield what a chip's compiler says about each program of inference, and its lines."""
+    for name in inference.names(config):
+        title = inference.title(config, name)
+        log(f"{title}: compiling it for one {chip.name} …")
+        report = target_compiler.compile_inference(config, name, chip)
+        yield report, report_lines(report, title)
+
+
+def _fit_on_target(
+    config: Config, stage: Stage, chip: Chip, launch: Launch, log: Any
+) -> tuple[StageReport, Iterator[str]]:
+    """Return the best settings of a stage that fit, according to a chip's compiler."""
+    found = fit.search(config, stage, chip, launch.devices, launch.tries, log)
+    best = found.best.report
+    assert best is not None
+    best = dataclasses.replace(best, tries=[one.summary for one in found.tries])
+    printed = report_lines(best, stage.title, stage.settings(config).batch)
+    return best, itertools.chain(printed, fit.lines(found))
 
 
 def _require_writable(file: Path) -> None:
@@ -277,13 +315,14 @@ def lines(plan: StagePlan) -> Iterator[str]:
         )
 
 
-def report_lines(report: StageReport, title: str, clips: int) -> Iterator[str]:
-    """Yield the lines of a chip's compiler's report, for the terminal."""
+def report_lines(report: StageReport, title: str, clips: int = 0) -> Iterator[str]:
+    """Yield the lines of a chip's compiler's report, for the terminal.
+
+    ``clips`` is the number of clips of a training step, 0 for a program of inference.
+    """
     yield ""
-    yield (
-        f"{title.capitalize()} on {report.devices} × {report.chip}: {arranged(report.mesh)}; "
-        f"{clips} clips a step"
-    )
+    on = f"{title[0].upper()}{title[1:]} on {report.devices} × {report.chip}"
+    yield f"{on}: {arranged(report.mesh)}; {clips} clips a step" if clips else on
     compiler = report.compiler
     yield (
         f"  compiled by {compiler['name']} {compiler['version']} in {duration(report.compile_s)}, "
@@ -296,9 +335,12 @@ def report_lines(report: StageReport, title: str, clips: int) -> Iterator[str]:
     needed = gib(report.peak_bytes) if report.peak_bytes is not None else "more"
     verdict = "fits" if report.fits else "does not fit"
     yield f"    {verdict}: {needed} of {gib(report.capacity_bytes)}"
+    if report.fits_gb:
+        fit_text = (f"{card} GB {'yes' if ok else 'no'}" for card, ok in report.fits_gb.items())
+        yield f"    fits a card of: {', '.join(fit_text)}"
     if report.refusal:
         yield f"    the compiler refused it: {report.refusal}"
-    yield "  work of a device in a step"
+    yield "  work of a device in a step" if clips else "  work"
     yield f"    {'needed':<42}{flop(report.flops_needed):>12}"
     yield f"    {'executed, with recomputation and padding':<42}{flop(report.flops_executed):>12}"
     if report.bytes is not None:
@@ -310,9 +352,10 @@ def report_lines(report: StageReport, title: str, clips: int) -> Iterator[str]:
         label = f"{item['kind']} along {item['axis']}, sent"
         yield f"    {label:<42}{size(item['bytes']):>12}"
     if report.roofline_s is not None and report.mfu is not None:
+        rates = f", {rate(clips / report.roofline_s)} clips/s" if clips else ""
         yield (
-            f"  at best {duration(report.roofline_s)} a step, bound by {report.bound}: MFU "
-            f"{report.mfu:.1%}, {rate(clips / report.roofline_s)} clips/s"
+            f"  at best {duration(report.roofline_s)}{' a step' if clips else ''}, bound by "
+            f"{report.bound}: MFU {report.mfu:.1%}{rates}"
         )
     for note in report.notes:
         yield f"  {note}"

@@ -240,6 +240,7 @@ class Job:
         products_s = sum(flops / (peak * REACHED[kind]) for kind, flops in done.items())
         streamed = self.work.traffic_on_device(mesh)
         streamed += OPTIMIZER * FLOAT * counts(self.config, self.stage)["trained"].on(mesh)
+        streamed += self._streamed_again(mesh)
         streaming_s = streamed / (self.chip.bandwidth * STREAMED)
         sent = self.traffic(mesh)
         seconds = {key: size / self._rate(mesh, key[1]) for key, size in sent.items()}
@@ -260,10 +261,19 @@ class Job:
             clips_per_s=clips / step_s,
         )
 
+    def _streamed_again(self, mesh: MeshSizes) -> float:
+        """Return the bytes of weights and sums of gradients that further micro-batches stream."""
+        c = counts(self.config, self.stage)
+        parts = self.stage.settings(self.config).micro_batches
+        wide = 2 if self.config.model.dtype == "bfloat16" else FLOAT
+        weights = (c["trained"].on(mesh) + c["frozen"].on(mesh)) * mesh.fsdp * wide
+        passes = 2 + self.work.recomputes
+        return (parts - 1) * (passes * weights + 3 * FLOAT * c["trained"].on(mesh))
+
     def traffic(self, mesh: MeshSizes) -> dict[tuple[str, str], float]:
         """Return the bytes that a device sends in a step, by kind and axis of the mesh.
 
-        Once per step, weights are gathered for the forward pass and for the backward pass
+        Once per micro-batch, weights are gathered for the forward pass and for the backward pass
         (``fsdp``), and once more if the backward pass recomputes the forward pass in 16 bits,
         because XLA then does not merge the two gathers. Gradients are reduce-scattered (``fsdp``)
         and summed over copies of the weights (``data``, ``context``). In every pass the results of
@@ -273,12 +283,13 @@ class Job:
         """
         c = counts(self.config, self.stage)
         wide = 2 if self.config.model.dtype == "bfloat16" else FLOAT
-        parameters = (c["trained"].on(mesh) + c["frozen"].on(mesh)) * mesh.fsdp * wide
-        gradients = c["trained"].on(mesh) * mesh.fsdp * wide
+        parts = self.stage.settings(self.config).micro_batches
+        parameters = parts * (c["trained"].on(mesh) + c["frozen"].on(mesh)) * mesh.fsdp * wide
+        gradients = parts * c["trained"].on(mesh) * mesh.fsdp * wide
         gathered = 2 + (self.work.recomputes and wide < FLOAT)
         summed = (2 + self.work.recomputes) * self.work.needed.summed / (mesh.batch * mesh.context)
         sent = {
-            ("all-gather", "fsdp"): (gathered * parameters + c["encoders"].count * wide)
+            ("all-gather", "fsdp"): (gathered * parameters + parts * c["encoders"].count * wide)
             * _ring(mesh.fsdp),
             ("reduce-scatter", "fsdp"): gradients * _ring(mesh.fsdp),
             ("all-reduce", "data"): 2 * gradients / mesh.fsdp * _ring(mesh.data),
@@ -336,7 +347,8 @@ def arrangements(
 
     ``tensor`` divides the numbers of heads; ``context`` is fixed.
     """
-    batch = stage.settings(config).batch
+    settings = stage.settings(config)
+    batch = settings.batch // settings.micro_batches
     heads: Mapping[str, int] = worlds.split_heads(config.model, stage)
     for tensor in _divisors(devices // context):
         rest = devices // tensor // context

@@ -1,7 +1,8 @@
-"""Compile a stage's real training step with the compiler of a chip that is not present.
+"""Compile a program with the compiler of a chip that is not present.
 
-The compilation runs in a process of its own, which ``compile_stage`` starts: the compilers read
-environment variables and hold gigabytes. The process traces the step from shapes on a described
+The program is the real training step of a stage (``compile_stage``) or one of inference
+(``compile_inference``). The compilation runs in a process of its own: the compilers read
+environment variables and hold gigabytes. The process traces the program from shapes on a described
 topology (``topology``), compiles it and reports what the compiler decided. Nothing runs, so times
 are bounds from data sheets and not measurements.
 """
@@ -50,10 +51,10 @@ _UNITS = {"": 1.0, "K": 2.0**10, "M": 2.0**20, "G": 2.0**30, "T": 2.0**40}
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class StageReport:
-    """What a chip's compiler says about one stage; bytes and FLOPs are of one device and step.
+    """What a chip's compiler says about one program; bytes and FLOPs are of one device and step.
 
     Attributes:
-        name: the stage.
+        name: the stage, or the program of inference.
         chip: the kind of device.
         devices: number of devices.
         mesh: devices along each mesh axis.
@@ -66,6 +67,7 @@ class StageReport:
         peak_bytes: memory of the program: arguments, temporary memory and new results.
         capacity_bytes: memory that a program may use.
         fits: whether it suffices.
+        fits_gb: size of a card in GB → whether the program fits it; of inference only.
         refusal: the compiler's reason if it refused the program.
         flops_needed: FLOPs that the mathematics needs.
         flops_executed: FLOPs with recomputation and padding.
@@ -75,6 +77,8 @@ class StageReport:
         roofline_s: lower bound of the time of a step.
         bound: what bounds it: flops, bytes or collectives.
         mfu: needed FLOPs over the peak FLOPs in that time.
+        flags: flags that select its settings; of ``--fit`` only.
+        tries: what was compiled to find them; of ``--fit`` only.
         trace_s: seconds of tracing and lowering.
         compile_s: seconds of compilation.
         notes: what is uncertain about the numbers.
@@ -93,6 +97,7 @@ class StageReport:
     peak_bytes: float | None = None
     capacity_bytes: float
     fits: bool = False
+    fits_gb: dict[str, bool] = dataclasses.field(default_factory=dict)
     refusal: str = ""
     flops_needed: float
     flops_executed: float
@@ -102,6 +107,8 @@ class StageReport:
     roofline_s: float | None = None
     bound: str = ""
     mfu: float | None = None
+    flags: str = ""
+    tries: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     trace_s: float = 0.0
     compile_s: float = 0.0
     notes: list[str] = dataclasses.field(default_factory=list)
@@ -113,16 +120,31 @@ def sent_by_axes(sent: Mapping[tuple[str, str], float]) -> list[dict[str, Any]]:
 
 
 def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> StageReport:
-    """Compile the stage of this name in a process of its own.
+    """Compile the training step of the stage of this name in a process of its own.
 
     Raises:
         UserError: the compiler is not installed, or it fails for another reason than memory.
     """
+    return _ask(config, chip, stage, devices, "stage")
+
+
+def compile_inference(config: Config, program: str, chip: Chip) -> StageReport:
+    """Compile a program of ``inference.NAMES`` for one device in a process of its own.
+
+    Raises:
+        UserError: as for ``compile_stage``.
+    """
+    return _ask(config, chip, program, 1, "inference")
+
+
+def _ask(config: Config, chip: Chip, name: str, devices: int, kind: str) -> StageReport:
+    """Start the process that compiles, and return its report."""
     topology.require_compiler(chip)
     request = {
         "config": serialize.to_dict(config),
         "plugins": _plugins(config),
-        "stage": stage,
+        "kind": kind,
+        "name": name,
         "chip": chip.name,
         "devices": devices,
         "parent": os.getpid(),
@@ -142,7 +164,7 @@ def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> Stage
         )
         if not answered.exists():
             lines = done.stderr.strip().splitlines() or [f"exit status {done.returncode}"]
-            raise UserError(f"The compiler of {chip.name} failed on {stage}: {lines[-1]}")
+            raise UserError(f"The compiler of {chip.name} failed on {name}: {lines[-1]}")
         answer = json.loads(answered.read_text())
     if "error" in answer:
         raise UserError(answer["error"])
@@ -168,7 +190,7 @@ def _plugins(config: Any) -> list[tuple[str, str]]:
 
 
 def main(asked: str, answered: str) -> None:
-    """Answer a request of ``compile_stage``: read its file and write the report's."""
+    """Answer a request of ``_ask``: read its file and write the report's."""
     request = json.loads(Path(asked).read_text())
     threading.Thread(target=_exit_after, args=(request["parent"],), daemon=True).start()
     try:
@@ -176,7 +198,8 @@ def main(asked: str, answered: str) -> None:
             _load(name, file)
         config = serialize.from_dict(Config, request["config"])
         chip = chips.named(request["chip"])
-        answer = dataclasses.asdict(_report(config, request["stage"], chip, request["devices"]))
+        made = _inference if request["kind"] == "inference" else _stage
+        answer = dataclasses.asdict(made(config, request["name"], chip, request["devices"]))
     except UserError as error:
         answer = {"error": str(error)}
     Path(answered).write_text(json.dumps(answer))
@@ -197,17 +220,16 @@ def _load(name: str, file: str) -> None:
     spec.loader.exec_module(sys.modules[name])
 
 
-def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageReport:
+def _stage(config: Config, name: str, chip: Chip, count: int) -> StageReport:
     """Trace and compile a stage, in the process for it."""
     import jax  # noqa: PLC0415 - only this process uses JAX
 
     from pewm_jax.data import abstract  # noqa: PLC0415
-    from pewm_jax.plan import measure, program, suggest  # noqa: PLC0415
+    from pewm_jax.plan import measure, suggest  # noqa: PLC0415
     from pewm_jax.train import runs, sharding, step  # noqa: PLC0415
 
-    (stage,) = (one for one in runs.planned(config) if one.name == stage_name)
-    devices = topology.devices(chip, count)
-    mesh = sharding.make_mesh(devices, config.train.mesh)
+    (stage,) = (one for one in runs.planned(config) if one.name == name)
+    mesh = sharding.make_mesh(topology.devices(chip, count), config.train.mesh)
     sizes = measure.MeshSizes(**{name: mesh.shape[name] for name in AXES})
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
     given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
@@ -218,7 +240,7 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
     trace_s = time.monotonic() - began
     work = measure.work_of(config, stage, traced, chip)
     report = StageReport(
-        name=stage.name,
+        name=name,
         chip=chip.name,
         devices=count,
         mesh=sizes.sizes,
@@ -230,6 +252,43 @@ def _report(config: Config, stage_name: str, chip: Chip, count: int) -> StageRep
         trace_s=trace_s,
         notes=list(UNKNOWN),
     )
+    return _compiled(report, lowered, config, chip)
+
+
+def _inference(config: Config, name: str, chip: Chip, count: int) -> StageReport:
+    """Trace and compile a program of inference, in the process for it."""
+    from pewm_jax.plan import inference, measure  # noqa: PLC0415
+    from pewm_jax.train import flops  # noqa: PLC0415
+
+    program = inference.program(config, name)
+    began = time.monotonic()
+    traced = inference.trace(program, topology.devices(chip, count)[0])
+    lowered = traced.lower()
+    trace_s = time.monotonic() - began
+    report = StageReport(
+        name=name,
+        chip=chip.name,
+        devices=count,
+        mesh=measure.MeshSizes().sizes,
+        compiler=topology.compiler(chip),
+        argument_bytes=program.argument_bytes,
+        capacity_bytes=topology.capacity(chip),
+        flops_needed=inference.needed(program).total,
+        flops_executed=flops.executed(traced.jaxpr, chip.platform).total,
+        trace_s=trace_s,
+        notes=[*UNKNOWN, inference.ALL_WEIGHTS],
+    )
+    report = _compiled(report, lowered, config, chip)
+    return dataclasses.replace(report, fits_gb=inference.fits_gb(report.peak_bytes))
+
+
+def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> StageReport:
+    """Compile a program, and return the report with what the compiler says."""
+    import jax  # noqa: PLC0415 - only this process uses JAX
+
+    from pewm_jax.plan import measure, program, suggest  # noqa: PLC0415
+
+    sizes = measure.MeshSizes(**report.mesh)
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="pewm-hlo-") as folder:
         # A TPU's compiled program cannot always be printed; what its compiler writes can be read.
@@ -292,8 +351,9 @@ def _text(compiled: Any, folder: Path) -> str:
         return compiled.as_text() or ""
     except JaxRuntimeError:
         for name in ("after_codegen", "after_optimizations"):
-            for file in folder.glob(f"*train_step*.{name}.txt"):
-                return file.read_text()
+            files = sorted(folder.glob(f"*.{name}.txt"), key=lambda file: file.stat().st_size)
+            if files:  # the largest: a program may bring small ones, such as of a constant
+                return files[-1].read_text()
     return ""
 
 

@@ -152,11 +152,13 @@ def require_divisible(config: Config, stage: Stage, mesh: Mesh | AbstractMesh) -
     Raises:
         ConfigError: they are not multiples of the devices that share them.
     """
-    batch, devices = stage.settings(config).batch, math.prod(mesh.shape[axis] for axis in BATCH)
-    if batch % devices:
+    settings, devices = stage.settings(config), math.prod(mesh.shape[axis] for axis in BATCH)
+    batch, parts = settings.batch, settings.micro_batches
+    if batch % (parts * devices):
+        split = f" in {parts} micro-batches" if parts > 1 else ""
         raise ConfigError(
-            f"train.{stage.name}.batch is {batch}, which cannot be split evenly over "
-            f"{devices} devices: use a multiple of {devices}."
+            f"train.{stage.name}.batch is {batch}{split}, which cannot be split evenly over "
+            f"{devices} devices: use a multiple of {parts * devices}."
         )
     tensor = mesh.shape["tensor"]
     heads: Mapping[str, int] = worlds.split_heads(config.model, stage)

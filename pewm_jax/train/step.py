@@ -22,7 +22,7 @@ from jax.sharding import Mesh
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.io import tree
-from pewm_jax.nn import target
+from pewm_jax.nn import placement, target
 from pewm_jax.train import optimizer, sharding
 from pewm_jax.types import Array, Clip, Params
 from pewm_jax.worlds.stages import Stage
@@ -140,13 +140,18 @@ def train_step(
     trained, frozen = tree.split(state.params, stage.trained)
     step_key = jax.random.fold_in(key, state.step)
 
-    def loss_of(trained: Params) -> tuple[Array, Metrics]:
+    def loss_of(trained: Params, clip: Clip, key: Array) -> tuple[Array, Metrics]:
         params = tree.merge(trained, frozen, extra or {})
-        found = stage.loss(config.model, config.train, params, clip, step_key)
+        found = stage.loss(config.model, config.train, params, clip, key)
         return _require_loss(found, f"The loss of {stage.title}")
 
-    (loss, measured), gradients = jax.value_and_grad(loss_of, has_aux=True)(trained)
-    gradients = sharding.constrain(config.model, gradients)
+    def differentiate(clip: Clip, key: Array) -> tuple[tuple[Array, Metrics], Params]:
+        found, gradients = jax.value_and_grad(loss_of, has_aux=True)(trained, clip, key)
+        return found, sharding.constrain(config.model, gradients)
+
+    parts = stage.settings(config).micro_batches
+    found = differentiate(clip, step_key) if parts == 1 else None
+    (loss, measured), gradients = found or _accumulate(differentiate, clip, step_key, parts)
     still = jax.tree.map(jnp.zeros_like, frozen)
     updates, opt_state = optimizer.make(config, stage).update(
         tree.merge(gradients, still), state.opt_state, state.params
@@ -171,6 +176,34 @@ def train_step(
         after = jax.tree.map(functools.partial(_select, good), after, unmoved)
         metrics["skipped"] = ~good
     return after, jax.tree.map(jnp.asarray, metrics)
+
+
+def _accumulate(differentiate: Callable[..., Any], clip: Clip, key: Array, parts: int) -> Any:
+    """Return the mean of ``differentiate(clip, key)`` over micro-batches of the clips.
+
+    Each micro-batch draws noise of its own. It has clips of every device: no clip is sent.
+    """
+
+    def split(x: Array) -> Array:
+        rows = x.reshape(len(x) // parts, parts, *x.shape[1:]).swapaxes(0, 1)
+        return placement.constrain(rows, None, "batch")
+
+    def add(total: Any, inputs: tuple[Array, Clip]) -> tuple[Any, None]:
+        number, part = inputs
+        found = _wide(differentiate(part, jax.random.fold_in(key, number)))
+        return jax.tree.map(jnp.add, total, found), None
+
+    micro = jax.tree.map(split, clip)
+    first = jax.tree.map(lambda x: x[0], micro)
+    shapes = jax.eval_shape(lambda: _wide(differentiate(first, key)))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    total, _ = jax.lax.scan(add, zeros, (jnp.arange(parts), micro))
+    return jax.tree.map(lambda x: x / parts, total)
+
+
+def _wide(found: Any) -> Any:
+    """Return losses, metrics and gradients in float32, as sums need it."""
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), found)
 
 
 def weights_key(config: Config, stage: Stage) -> Array:

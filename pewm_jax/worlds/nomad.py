@@ -58,10 +58,12 @@ class NomadTrainConfig(TrainSettings):
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
+        clips = self.policy.batch // self.policy.micro_batches
+        name = "train.policy.batch" if self.policy.micro_batches == 1 else "A micro-batch"
         require(
-            self.policy.batch >= 2,
-            "train.policy.batch is 1: a goal that cannot be reached is taken from another clip of "
-            "the batch, use 2 or more.",
+            clips >= 2,
+            f"{name} is {clips}: a goal that cannot be reached is taken from another clip of the "
+            "batch, use 2 or more.",
         )
         names = ("goal_hidden", "distance_weight")
         require_fields(self, "train", lambda value: 0 <= value <= 1, "a share in [0, 1]", *names)

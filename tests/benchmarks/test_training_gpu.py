@@ -10,6 +10,7 @@ import pytest
 from pewm_jax import presets as configs
 from pewm_jax.config import UserError
 from pewm_jax.worlds.pewm import world as pewm
+from tests.plan.test_target_compiler import report
 from tests.train import fakes
 
 
@@ -48,6 +49,7 @@ def test_batches_grow_until_the_memory_ends_and_no_part_is_done_twice(
 ):
     numbers = {"s": 0.1, "predicted_s": 0.2, "mfu": 0.5, "predicted_mfu": 0.25}
     numbers |= {"peak_gb": 50.0, "held_gb": 51.0, "compile_s": 60.0}
+    numbers |= {"plan_s": 0.05, "plan_gb": 48.0}
     asked = []
 
     def run(command, **_options):
@@ -69,10 +71,27 @@ def test_batches_grow_until_the_memory_ends_and_no_part_is_done_twice(
     gpu.main(state)
     assert asked == [(number, batch) for batch in (1, 2, 4) for number in (1, 2)]
     out = capsys.readouterr().out
-    assert "| 2, 2 | 100 | 200 | 20.00 | 50.0% | 25.0% | 50.0 | 51.0 | 60 |" in out
-    assert "| 1, 4 | out of memory |  |  |  |  |  | 99.0 |  |" in out
+    assert "| 2, 2 | 100 | 200 | 50 | 20.00 | 50.0% | 25.0% | 50.0 | 48.0 | 51.0 | 60 |" in out
+    assert "| 1, 4 | out of memory |  |  |  |  |  |  |  | 99.0 |  |" in out
     gpu.main(state)
     assert len(asked) == 6
+
+
+def test_the_plan_of_the_compiler_is_beside_what_is_measured(gpu, monkeypatch, capsys):
+    chip, asked = gpu.chips.named("h100"), []
+
+    def compiled(config, name, chip, devices):
+        asked.append((name, chip.name, devices))
+        if name == "stage2":
+            raise UserError("--compiler target for h100 needs jax-cuda12-plugin.")
+        return report(peak_bytes=30e9, roofline_s=0.5)
+
+    monkeypatch.setattr(gpu.target_compiler, "compile_stage", compiled)
+    config = gpu.setting("tiny", pewm.STAGES[0], 1)
+    assert gpu.planned(config, pewm.STAGES[0], chip) == {"plan_gb": 30.0, "plan_s": 0.5}
+    assert gpu.planned(config, pewm.STAGES[1], chip) == {}
+    assert asked == [("stage1", "h100", 1), ("stage2", "h100", 1)]
+    assert "no plan of the compiler: --compiler target" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -268,7 +268,7 @@ WORLD = ("start", "observe", "imagine", "imagine_many", "rollout")
 
 
 def test_every_public_function_is_covered():
-    assert set(FUNCTIONS) == {*GOOD, *WORLD, "load"}
+    assert set(FUNCTIONS) == {*GOOD, *WORLD, "load", "cache_compilation"}
 
 
 def refusal(function, *args, **kwargs):
@@ -300,6 +300,12 @@ def test_loading_refuses_every_bad_path(bad):
     for what, value in STRANGE.items():
         if what != "text":
             assert "load()" in refusal(pewm_jax.load, value)
+
+
+def test_a_cache_refuses_what_is_no_folder():
+    for what, value in STRANGE.items():
+        if what != "text":
+            assert "cache_compilation()" in refusal(pewm_jax.cache_compilation, value)
 
 
 @pytest.mark.parametrize("what", STRANGE)

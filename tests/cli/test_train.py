@@ -455,6 +455,7 @@ def test_absent_data_are_a_sentence_and_the_run_can_be_started_again(tmp_path):
 
 def test_a_compilation_cache_that_the_caller_chose_stays(tmp_path):
     old = jax.config.jax_compilation_cache_dir
+    small = {name: getattr(jax.config, name) for name, *_ in runtime.SMALL_TOO}
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path / "mine"))
         runtime.cache_compilation(tmp_path / "runs")
@@ -466,6 +467,10 @@ def test_a_compilation_cache_that_the_caller_chose_stays(tmp_path):
         jax.config.update("jax_enable_compilation_cache", True)
         runtime.cache_compilation(tmp_path / "runs")
         assert jax.config.jax_compilation_cache_dir.startswith(str(tmp_path / "runs"))
+        for name, _, ours in runtime.SMALL_TOO:
+            assert getattr(jax.config, name) == ours
     finally:
+        for name, value in small.items():
+            jax.config.update(name, value)
         jax.config.update("jax_enable_compilation_cache", True)
         jax.config.update("jax_compilation_cache_dir", old)

@@ -19,6 +19,7 @@ from pewm_jax.convert import stablehlo as stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
 from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.nn import attention
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.train import runs
 from pewm_jax.worlds import world_model
@@ -149,9 +150,38 @@ def test_platforms_that_a_program_cannot_be_lowered_for_are_left_out():
 
     shape = {"x": jax.ShapeDtypeStruct((2,), jnp.float32)}
     program = stablehlo_programs.Program("", only_cpu, shape)
-    assert stablehlo_programs.lower(program, {}, ["cpu", "tpu"]).platforms == ("cpu",)
+    (lowered,) = stablehlo_programs.lower(program, {}, ["cpu", "tpu"])
+    assert lowered.platforms == ("cpu",)
     with pytest.raises(UserError, match="cannot be lowered for tpu"):
         stablehlo_programs.lower(program, {}, ["tpu"])
+
+
+def test_platforms_with_other_kernels_have_programs_of_their_own():
+    def attend(weights, inputs):
+        del weights
+        return {"y": attention.attention(inputs["x"], inputs["x"], inputs["x"], "auto")}
+
+    program = stablehlo_programs.Program(
+        "", attend, {"x": jax.ShapeDtypeStruct((1, 2, 512, 64), jnp.bfloat16)}
+    )
+    common, tpu = stablehlo_programs.lower(program, {}, stablehlo.PLATFORMS)
+    assert (common.platforms, tpu.platforms) == (("cpu", "cuda"), ("tpu",))
+    assert "tpu_custom_call" in tpu.mlir_module()
+    assert "custom_call" not in common.mlir_module()
+    entry = stablehlo._entry("attend", program, (common, tpu))
+    both = dict.fromkeys(("cpu", "cuda"), "attend.jaxexport")
+    assert entry["files"] == {**both, "tpu": "attend.tpu.jaxexport"}
+    assert entry["platforms"] == list(stablehlo.PLATFORMS)
+    assert "`attend.tpu.jaxexport` (tpu)" in stablehlo._files_text(entry)
+    assert "`attend.jaxexport` (cpu, cuda)" in stablehlo._files_text(entry)
+
+
+def test_a_tiny_model_is_lowered_for_every_platform(params):
+    denoise = stablehlo.denoise_program(CONFIG, params)
+    rollout = stablehlo.rollout_programs(CONFIG, params, 2, 1)
+    for program in (denoise, *rollout.values()):
+        found = stablehlo.lower(program, tree.flatten(params), stablehlo.PLATFORMS)
+        assert {name for one in found for name in one.platforms} == set(stablehlo.PLATFORMS)
 
 
 @pytest.mark.parametrize(

@@ -177,3 +177,58 @@ def test_the_stages_cover_the_parameters_of_the_real_model():
     decayed = tree.flatten(tree.assign(optimizer.DECAYED, params))
     assert any(decayed.values())
     assert not all(decayed.values())
+
+
+@pytest.mark.parametrize("parts", [2, 4, 8])
+def test_micro_batches_give_the_mean_gradient_of_their_clips(fake_model, parts):
+    """Equal to the mean of losses and gradients of each part, with its own noise."""
+    config = fakes.config()
+    split = fakes.with_stage(config, "stage1", micro_batches=parts)
+    mesh = sharding.make_mesh(jax.devices()[:1])
+    now, batch = step.initial_state(config, ONE, mesh), fakes.clip(config, 8, 0)
+    key = step.noise_key(config, ONE)
+    step_key = jax.random.fold_in(key, 0)
+    params = jax.tree.map(np.array, now.params)
+    found = [
+        jax.value_and_grad(lambda p, clip, key: ONE.loss(None, None, p, clip, key)[0])(
+            params,
+            jax.tree.map(lambda x, number=number: x[number::parts], batch),
+            jax.random.fold_in(step_key, number),
+        )
+        for number in range(parts)
+    ]
+    loss, gradients = jax.tree.map(lambda *x: sum(x) / parts, *found)
+    after, metrics = step.compile_step(split, ONE, mesh, batch)(
+        now, jax.device_put(batch, sharding.of_batch(mesh)), key
+    )
+    norm = np.sqrt(sum(float((x**2).sum()) for x in jax.tree.leaves(gradients)))
+    np.testing.assert_allclose(metrics["loss"], loss, rtol=1e-5)
+    np.testing.assert_allclose(metrics["loss_rgb"], loss, rtol=1e-5)
+    np.testing.assert_allclose(metrics["grad_norm"], norm, rtol=1e-5)
+    assert after.step == 1
+
+
+def test_micro_batches_without_noise_change_nothing(monkeypatch):
+    def noiseless(model, train, params, clip, key, *, memory):
+        rgb = jnp.asarray(clip.frames.rgb_THWC, jnp.float32) / 255
+        out = rgb @ params["backbone"]["kernel"] + params["backbone"]["bias"]
+        return jnp.mean((out - rgb[..., ::-1]) ** 2), {"count": jnp.int32(len(rgb))}
+
+    fakes.install(monkeypatch, noiseless)
+    stage = dataclasses.replace(ONE, loss=functools.partial(noiseless, memory=False))
+    states = []
+    for parts in (1, 4):
+        config = fakes.with_stage(fakes.config(), "stage1", micro_batches=parts)
+        states.append(run(config, stage, 3)[1][-1])
+    one, four = (tree.flatten(now.params) for now in states)
+    for path, leaf in one.items():
+        np.testing.assert_allclose(four[path], leaf, rtol=1e-4, atol=1e-6)
+
+
+def test_a_batch_that_micro_batches_do_not_divide_is_refused():
+    with pytest.raises(ConfigError, match="micro_batches is 3: use a divisor of the batch, 8"):
+        fakes.with_stage(fakes.config(), "stage1", micro_batches=3)
+    config = fakes.with_stage(fakes.config(), "stage1", micro_batches=4)
+    mesh = jax.sharding.AbstractMesh((4, 1, 1, 1), AXES)
+    with pytest.raises(ConfigError, match=r"8 in 4 micro-batches.*use a multiple of 16"):
+        sharding.require_divisible(config, ONE, mesh)

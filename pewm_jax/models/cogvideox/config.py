@@ -69,9 +69,10 @@ class DiTConfig:
     """Divisor of row and column positions in `sincos`."""
     temporal_interpolation: float = 1.0
     """Divisor of time positions in `sincos`."""
-    attention: Literal["auto", "xla", "cudnn", "splash"] = "auto"
+    attention: Literal["auto", "xla", "cudnn", "splash", "ring"] = "auto"
     """The attention kernel: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `splash` is flash
-    attention on TPUs, `xla` runs anywhere, `auto` uses the best kernel of the hardware."""
+    attention on TPUs, `xla` runs anywhere, `auto` uses the best kernel of the hardware. `ring`
+    splits keys and values over `train.mesh.context`, too, for very long clips."""
     remat: bool = False
     """Recompute activations in the backward pass: less memory, about a third more time."""
 

@@ -54,9 +54,10 @@ class CosmosConfig:
     """Whether a learned embedding of positions is added before every block (Predict1)."""
     padding_mask: bool = True
     """Whether a mask of padded pixels is joined to the input."""
-    attention: Literal["auto", "xla", "cudnn", "splash"] = "auto"
+    attention: Literal["auto", "xla", "cudnn", "splash", "ring"] = "auto"
     """The attention kernel: `cudnn` is flash attention on NVIDIA GPUs in 16 bits, `splash` is flash
-    attention on TPUs, `xla` runs anywhere, `auto` uses the best kernel of the hardware."""
+    attention on TPUs, `xla` runs anywhere, `auto` uses the best kernel of the hardware. `ring`
+    splits keys and values over `train.mesh.context`, too, for very long clips."""
     remat: bool = False
     """Recompute activations in the backward pass: less memory, about a third more time."""
 

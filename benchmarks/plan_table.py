@@ -1,0 +1,210 @@
+"""The tables of docs/scaling.md by the chips' own compilers: training and inference.
+
+    make plan-table                                  # both tables; hours on two cores
+    make plan-table ARGS="--only training --chips h100 --presets pewm_2b"
+    make plan-table ARGS=--record                    # and rewrites the tables
+
+No device is needed, only the extras plan-tpu and plan-cuda. Every number is one that `pewm-jax plan
+PRESET --chip C --devices N --compiler target [--inference]` prints. Finished programs are kept in
+``--folder`` by their settings, the chip and the compiler's version: after an interruption, run the
+same command again. After a change of the library's code, choose another folder. ``--kept`` compiles
+nothing and prints what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from record import machine, record, table
+
+from pewm_jax import presets
+from pewm_jax.cli import parser as cli
+from pewm_jax.config import Config, UserError, serialize
+from pewm_jax.io.store import TABLE, ResultCache, inputs_hash, map_resumable
+from pewm_jax.plan import inference, target_compiler, topology
+from pewm_jax.plan.plan import arranged, flop, gib
+from pewm_jax.plan.target_compiler import StageReport
+from pewm_jax.train import chips, runs
+from pewm_jax.train.chips import Chip
+from pewm_jax.train.log import duration
+
+PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
+PRESETS = ("pewm_2b", "pewm_5b", "pewm_5b_i2v", "egowm_svd", "egowm_cosmos2b", "persist_xl")
+TRAINING, INFERENCE = "training", "inference"
+CHIPS = {TRAINING: ("h100", "v5p"), INFERENCE: ("h100", "a100", "v5e", "v6e")}
+"""Chips of each table; the compilers of GPUs are faster."""
+DEVICES = 8
+HEADS = {
+    TRAINING: (
+        *("model", "stage", "devices", "mesh", "memory of a device", "fits", "executed"),
+        *("attention", "step at best", "bound by", "MFU", "compiled in"),
+    ),
+    INFERENCE: (
+        *("model", "program", "chip", "memory", *(f"{gb} GB" for gb in inference.CARDS_GB)),
+        *("executed", "at best", "bound by", "compiled in"),
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Piece:
+    """A program of a table.
+
+    Attributes:
+        table: which one.
+        preset: its name.
+        name: the stage, or the program of inference.
+        title: its description.
+        chip: the kind of device.
+        devices: their number.
+    """
+
+    table: str
+    preset: str
+    name: str
+    title: str
+    chip: Chip
+    devices: int
+
+    @property
+    def config(self) -> Config:
+        """Return the settings."""
+        return presets.load(self.preset)
+
+    @property
+    def key(self) -> str:
+        """Return the name of the result, with all that it depends on."""
+        compiler = topology.compiler(self.chip)
+        settings = serialize.to_dict(self.config)
+        code = inputs_hash([settings, self.name, self.chip.name, self.devices, compiler])[:16]
+        return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{self.devices}-{code}"
+
+    def compile(self) -> StageReport:
+        """Ask the chip's compiler."""
+        if self.table == TRAINING:
+            return target_compiler.compile_stage(self.config, self.name, self.chip, self.devices)
+        return target_compiler.compile_inference(self.config, self.name, self.chip)
+
+
+def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:
+    """Yield the programs of a table."""
+    for chip in map(chips.named, options.chips or CHIPS[which]):
+        for preset in options.presets:
+            config = presets.load(preset)
+            if which == INFERENCE:
+                for name in inference.names(config):
+                    yield Piece(which, preset, name, inference.title(config, name), chip, 1)
+                continue
+            for stage in runs.planned(config):
+                yield Piece(which, preset, stage.name, stage.title, chip, options.devices)
+
+
+def compiled(missing: list[Piece]) -> Iterator[tuple[Piece, dict[str, Any]]]:
+    """Yield each program with its numbers; a compiler's failure is kept as its sentence."""
+    for piece in missing:
+        print(f"{piece.preset}, {piece.title}, {piece.chip.name}: compiling …", flush=True)
+        try:
+            found = dataclasses.asdict(piece.compile())
+        except UserError as error:
+            found = {"error": str(error)}
+            print(f"  {error}", flush=True)
+        yield piece, found
+
+
+def row(piece: Piece, found: dict[str, Any]) -> list[str]:
+    """Return a line of a table."""
+    head = [piece.preset, piece.title.removeprefix("stage ")]
+    if "error" in found:
+        return [*head, f"{piece.devices} × {piece.chip.name}", found["error"]]
+    report = StageReport(**found)
+    peak = "more" if report.peak_bytes is None else gib(report.peak_bytes)
+    bound = "" if report.roofline_s is None else duration(report.roofline_s)
+    times = [bound, report.bound]
+    if piece.table == INFERENCE:
+        cards = ["yes" if ok else "**no**" for ok in report.fits_gb.values()]
+        executed = flop(report.flops_executed)
+        return [*head, piece.chip.name, peak, *cards, executed, *times, duration(report.compile_s)]
+    kernels = sorted(report.kernels.get("attention", {}))
+    fits = "yes" if report.fits else "**no**"
+    return [
+        *head,
+        f"{report.devices} × {report.chip}",
+        arranged({name: n for name, n in report.mesh.items() if n > 1}),
+        f"{peak} of {gib(report.capacity_bytes)}",
+        fits,
+        flop(report.flops_executed),
+        _family(kernels),
+        *times,
+        "" if report.mfu is None else f"{report.mfu:.0%}",
+        duration(report.compile_s),
+    ]
+
+
+def _family(kernels: Sequence[str]) -> str:
+    """Return the kind of the attention kernels."""
+    kinds = {"cudnn": "cuDNN", "splash": "splash"}
+    found = {kind for name in kernels for word, kind in kinds.items() if word in name}
+    return ", ".join(sorted(found)) or "XLA"
+
+
+def arguments(argv: Sequence[str]) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--only", choices=tuple(CHIPS), help="one of the tables")
+    parser.add_argument("--presets", nargs="+", default=PRESETS)
+    parser.add_argument("--chips", nargs="+", default=())
+    parser.add_argument(
+        "--names", nargs="+", default=(), help="stages or programs, such as clip-50"
+    )
+    parser.add_argument("--devices", type=int, default=DEVICES, help="devices of a training")
+    parser.add_argument("--folder", type=Path, default=Path("runs/plan-table"))
+    parser.add_argument("--kept", action="store_true", help="compile nothing")
+    parser.add_argument("--record", action="store_true", help="rewrite docs/scaling.md")
+    parser.add_argument("--page", type=Path, default=PAGE, help="the page to rewrite")
+    return parser.parse_args(argv)
+
+
+def main(argv: Sequence[str]) -> None:
+    """Compile what is missing, print the tables, and write them if asked to."""
+    options = arguments(argv)
+    cache = ResultCache(options.folder, TABLE)
+    for which in (options.only,) if options.only else CHIPS:
+        asked = [
+            one for one in pieces(which, options) if one.name in (options.names or (one.name,))
+        ]
+        for chip in {piece.chip for piece in asked}:
+            topology.require_compiler(chip)
+        if options.kept:
+            found = {one: kept for one in asked if (kept := cache.get(one.key)) is not None}
+        else:
+            found = map_resumable(
+                asked,
+                lambda piece: piece.key,
+                compiled,
+                cache=cache,
+                what=f"programs of {which}",
+                log=print,
+                is_usable=lambda _, kept: "error" not in kept,
+            )
+        compilers = {
+            f"{told['compiler']['name']} {told['compiler']['version']}"
+            for told in found.values()
+            if "error" not in told
+        }
+        rows = [row(piece, told) for piece, told in found.items()]
+        width = len(HEADS[which])
+        rows = [[*cells, *[""] * (width - len(cells))] for cells in rows]
+        source = f"Compiled by {'; '.join(sorted(compilers))}. {machine('jax')}."
+        text = f"{table(HEADS[which], rows)}\n\n{source}"
+        print(f"\n{text}\n")
+        if options.record:
+            record(f"plan-{which}", text, options.page)
+
+
+if __name__ == "__main__":
+    sys.exit(cli.run(main))

@@ -1,0 +1,86 @@
+"""The tables of all presets: kept programs, rows, and the page."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pewm_jax.config import UserError
+from pewm_jax.plan import inference
+from tests.plan.test_target_compiler import report
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def tables(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import plan_table
+
+    asked = []
+
+    def compile_stage(config, name, chip, devices):
+        asked.append((name, chip.name, devices))
+        if chip.name == "v5p" and name == "stage2":
+            raise UserError("The compiler of v5p failed on stage2: no.")
+        return report(name=name, chip=chip.name, devices=devices)
+
+    def compile_inference(config, name, chip):
+        asked.append((name, chip.name, 1))
+        return report(name=name, chip=chip.name, devices=1, fits_gb=inference.fits_gb(20e9))
+
+    monkeypatch.setattr(plan_table.topology, "require_compiler", lambda chip: None)
+    monkeypatch.setattr(plan_table.topology, "compiler", lambda chip: {"name": "c", "version": "1"})
+    monkeypatch.setattr(plan_table.target_compiler, "compile_stage", compile_stage)
+    monkeypatch.setattr(plan_table.target_compiler, "compile_inference", compile_inference)
+    yield plan_table, asked
+    for name in ("plan_table", "record"):
+        sys.modules.pop(name, None)
+
+
+def test_both_tables_are_printed_and_finished_programs_are_kept(tables, tmp_path, capsys):
+    plan_table, asked = tables
+    flags = ["--presets", "tiny", "--chips", "h100", "v5p", "--folder", str(tmp_path / "kept")]
+    plan_table.main(flags)
+    names = inference.names(plan_table.presets.load("tiny"))
+    stages = [(name, chip, 8) for chip in ("h100", "v5p") for name in ("stage1", "stage2")]
+    assert asked == stages + [(name, chip, 1) for chip in ("h100", "v5p") for name in names]
+    printed = capsys.readouterr().out
+    assert "| tiny | 1 | 8 × h100 | fsdp 8 | 34.00 GiB of 95.00 GiB | yes |" in printed
+    assert "| splash | 8.7 s | flops | 75% |" in printed
+    assert "| tiny | 2 | 8 × v5p | The compiler of v5p failed on stage2: no. |" in printed
+    assert "| h100 | 34.00 GiB | **no** | yes | yes |" in printed
+    asked.clear()
+    plan_table.main([*flags, "--only", "training", "--kept"])
+    assert asked == []
+    plan_table.main(flags)
+    assert asked == [("stage2", "v5p", 8)], "a failure is tried again"
+    asked.clear()
+    plan_table.main([*flags, "--only", "inference", "--names", "start", "--folder", str(tmp_path)])
+    assert asked == [("start", "h100", 1), ("start", "v5p", 1)]
+
+
+def test_the_page_gets_the_tables(tables, tmp_path):
+    plan_table, _ = tables
+    page = tmp_path / "scaling.md"
+    page.write_text((ROOT / "docs" / "scaling.md").read_text())
+    flags = ["--presets", "tiny", "--chips", "h100", "--folder", str(tmp_path / "kept")]
+    plan_table.main([*flags, "--record", "--page", str(page)])
+    text = page.read_text()
+    for which in plan_table.CHIPS:
+        inside = text.split(f"<!-- plan-{which} -->")[1].split(f"<!-- /plan-{which} -->")[0]
+        assert inside.count("| tiny |") == (2 if which == "training" else 5)
+        assert "Compiled by libtpu 0.0.51." in inside
+
+
+def test_make_runs_the_command_with_the_compilers_installed():
+    done = subprocess.run(
+        ["make", "--dry-run", "plan-table", "ARGS=--kept"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "benchmarks/plan_table.py --kept" in done.stdout
+    assert "plan-tpu,plan-cuda" in done.stdout
