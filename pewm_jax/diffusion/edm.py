@@ -26,7 +26,8 @@ class EDMConfig(Noise):
     """Continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364)."""
 
     sigma_data: float = 0.5
-    """Standard deviation of clean latents."""
+    """Standard deviation of clean latents: about 1 for the codec `learned`, of which
+    `pewm-jax evaluate` prints it."""
     sigma_min: float = 0.002
     """Smallest σ in sampling."""
     sigma_max: float = 80.0

@@ -48,6 +48,7 @@ LABELS = {
     "depth_relative": "depth error, relative",
     "square_rgb": "latents of colour, mean square",
     "square_depth": "latents of depth, mean square",
+    "sigma_data": "latents, noise.sigma_data",
 }
 """The scores, as they are printed, besides LPIPS by network and the distances of sets."""
 
@@ -229,7 +230,7 @@ def measures(model: CodecTask, params: Params, frames: Frames) -> dict[str, Arra
     over measured pixels within the model's range, ``depth_cm``, the mean absolute error in cm, and
     ``depth_relative`` (NaN if nothing was measured); ``square_rgb`` and ``square_depth``, the mean
     squares of the normalised latents, whose mean is about 1 if the frames resemble the training
-    data.
+    data; ``sigma_data``, the root of the mean square of both, for the noise ``edm``.
     """
     return _measure(model, params, frames)[0]
 
@@ -248,12 +249,14 @@ def _measure(model: CodecTask, params: Params, frames: Frames) -> tuple[dict[str
     inside = (depth >= model.clip.near_m) & (depth <= model.clip.far_m)
     off = jnp.abs(depth_from_signal(model.clip, decoded[1].mean(-1)) - depth) * inside
     count = inside.sum((1, 2))
+    squares = jnp.square(latents).mean((2, 3, 4))
     found = {
         "psnr": psnr(squared.mean((1, 2, 3))),
         "depth_cm": 100 * off.sum((1, 2)) / count,
         "depth_relative": (off / jnp.where(inside, depth, 1)).sum((1, 2)) / count,
-        "square_rgb": jnp.square(latents[0]).mean((1, 2, 3)),
-        "square_depth": jnp.square(latents[1]).mean((1, 2, 3)),
+        "square_rgb": squares[0],
+        "square_depth": squares[1],
+        "sigma_data": jnp.sqrt(squares.mean(0)),
     }
     if min(made.shape[1:3]) >= WINDOW:
         found["ssim"] = ssim_map(made, truth).mean((1, 2))

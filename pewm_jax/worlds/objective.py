@@ -220,13 +220,13 @@ def _warped(
     model: AssembledModel, params: Params, clip: Clip, observed: Frames, rows: int
 ) -> Array:
     """Return ``world_model.everywhere`` of a batch; if prepared, only its leading rows are made."""
-    prepared = clip.extras.get("everywhere_thwC")
-    inputs = observed, clip.frames.camera
+    prepared, camera = clip.extras.get("everywhere_thwC"), clip.frames.camera
     if prepared is not None:
-        inputs = jax.tree.map(lambda x: x[:rows], inputs)
         if not rows:
             return prepared
-    made = world_model.everywhere(model, params, *inputs)
+        observed, camera = jax.tree.map(lambda x: x[:rows], (observed, camera))
+    made = world_model.everywhere(model, params, observed, camera)
+    assert made is not None
     return made if prepared is None else jnp.concatenate([made, prepared[rows:]])
 
 

@@ -224,7 +224,7 @@ def _sensor(view: View, points: Array, camera: Camera, key: Array) -> View:
     view = _without(view, _edges(depth) & dropped)
     size = QUADRATIC * jax.random.uniform(size_key)
     noisy = view.depth_THW + size * view.depth_THW**2 * jax.random.normal(noise_key, depth.shape)
-    noisy = jnp.where(view.depth_THW > 0, jnp.maximum(noisy, 0), 0)
+    noisy = jnp.maximum(noisy, view.depth_THW / 2)  # never 0, which means not measured
     view = _moved_camera(dataclasses.replace(view, depth_THW=noisy), camera, pose_key)
     frames = (len(depth), 1, 1, 1)
     gain, bias = jax.random.normal(light_key, (2, *frames))

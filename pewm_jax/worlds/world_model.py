@@ -125,6 +125,7 @@ def everywhere(
             latents_BthwC = rgbd.encode_rgbd(
                 model, params, observed.rgb_THWC, observed.depth_THW, condition=True
             )
+        assert latents_BthwC is not None
         last = latents_BthwC[:, -1:]
         latents = jnp.broadcast_to(last, (len(last), *model.latent_shape, last.shape[-1]))
         mask = jnp.ones((*latents.shape[:-1], 1))

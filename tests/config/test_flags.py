@@ -117,6 +117,19 @@ def test_every_kind_can_be_put_into_its_section(section):
         assert kinds.of(found).name == name
 
 
+def test_small_takes_noise_of_another_kind_with_its_rendered_memory():
+    small = presets.load("small")
+    flags = ["--noise.kind", "edm", "--noise.sigma_data", 1, "--noise.log_mean", -0.4]
+    flags += ["--noise.sample_steps", 5, "--noise.rendered_until", 1, "--observed", "warped"]
+    config = parse(*flags, "--train.memory_errors", 0.3, default=small)
+    assert config.model.noise == EDMConfig(
+        sigma_data=1.0, log_mean=-0.4, sample_steps=5, rendered_until=1.0
+    )
+    assert config.model.memory == small.model.memory
+    assert (config.model.observed, config.train.memory_errors) == ("warped", 0.3)
+    assert parse("--noise.max_weight", 5, default=small).model.noise.max_weight == 5
+
+
 def test_another_kind_keeps_what_both_have_and_takes_settings_of_its_own():
     memory = parse("--memory.kind", "images", "--memory.snapshots", 3, "--memory.tokens=9")
     memory = memory.model.memory
