@@ -20,6 +20,7 @@ def config() -> Config:
             start="runs/codec",
             codec=still,
             statistics=still,
+            gate=still,
             sharpen=StageConfig(steps=2000, batch=16, learning_rate=3e-4, warmup=50),
             ema=0.998,
         ),

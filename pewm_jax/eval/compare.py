@@ -225,9 +225,9 @@ def _videos(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any] | No
     They are numbers of a whole set of clips, so they are not paired and have no interval. They are
     compared only if they have equal names: the same network, frames and number of clips.
     """
-    found = [[report.metrics.get("videos") for report in group] for group in (one, two)]
-    everywhere = [videos for group in found for videos in group]
-    if not all(everywhere) or any(x["names"] != everywhere[0]["names"] for x in everywhere):
+    everywhere = [report.metrics.get("videos") or {} for report in (*one, *two)]
+    names = everywhere[0].get("names")
+    if not names or any(videos.get("names") != names for videos in everywhere):
         return None
 
     def tables(report: Report) -> dict[str, Any]:
@@ -237,7 +237,6 @@ def _videos(one: Sequence[Report], two: Sequence[Report]) -> dict[str, Any] | No
 
     sides = [[tables(report) for report in group] for group in (one, two)]
     shared = [mask for mask in MASKS if all(mask in table for group in sides for table in group)]
-    names = everywhere[0]["names"]
 
     def mean(group: Sequence[Mapping[str, Any]], mask: str, kind: str) -> float:
         return float(np.mean([table[mask][kind]["value"] for table in group]))

@@ -73,7 +73,7 @@ def make(config: Config, stage: Stage) -> optax.GradientTransformation:
         optax.scale_by_learning_rate(schedule(settings)),
         *([_rates(stage)] if stage.rates else []),
     )
-    chains = {TRAIN: trains, FREEZE: optax.set_to_zero()}
+    chains: dict[Any, Any] = {TRAIN: trains, FREEZE: optax.set_to_zero()}
     if stage.training_only:
         chains[ADVERSARY] = adversary(config, settings)
     return optax.partition(chains, stage.labels)

@@ -110,7 +110,7 @@ def descend(config, params, stage, count, rate, clips_of):
 @pytest.mark.slow
 def test_descent_lowers_the_loss_and_then_the_latents_are_distributed_normally():
     config = experiment()
-    first, second = worlds.stages(config)
+    first, second, _ = worlds.stages(config)
     params = init(config, jax.random.key(0))
     params, found = descend(config, params, first, 20, 5e-3, lambda n: batch(config, seed=n % 2))
     assert found[-1][0] < 0.8 * found[0][0]

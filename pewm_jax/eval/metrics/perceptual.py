@@ -160,8 +160,8 @@ def _sums_to_features(
     def one(parts: tuple[Array, tuple[Array, ...], Array]) -> Array:
         picture, described, masks_KHW = parts
         mine = lpips.describe(net, params, picture[None])
-        given = mine, [x[None] for x in described], masks_KHW[None]
-        return lpips.sums_in_masks(params, *given)[0]
+        theirs = [x[None] for x in described]
+        return lpips.sums_in_masks(params, mine, theirs, masks_KHW[None])[0]
 
     masks = masks_BTKHW.reshape(-1, *masks_BTKHW.shape[2:])
     found = _map_images(one, (_signals(imagined_BTHWC), truth, masks))
@@ -175,9 +175,9 @@ def _sums_in_masks(
     """Sum the map of distances of colours in [0, 1] under masks, frame by frame."""
 
     def one(parts: tuple[Array, Array, Array]) -> Array:
-        *pictures, masks_KHW = parts
-        both = (lpips.describe(net, params, picture[None]) for picture in pictures)
-        return lpips.sums_in_masks(params, *both, masks_KHW[None])[0]
+        imagined, truth, masks_KHW = parts
+        a, b = (lpips.describe(net, params, picture[None]) for picture in (imagined, truth))
+        return lpips.sums_in_masks(params, a, b, masks_KHW[None])[0]
 
     masks = masks_BTKHW.reshape(-1, *masks_BTKHW.shape[2:])
     found = _map_images(one, (_signals(imagined_BTHWC), _signals(truth_BTHWC), masks))
