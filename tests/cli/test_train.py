@@ -465,6 +465,8 @@ def test_a_compilation_cache_that_the_caller_chose_stays(tmp_path):
         runtime.cache_compilation(tmp_path / "runs")
         assert jax.config.jax_compilation_cache_dir is None
         jax.config.update("jax_enable_compilation_cache", True)
+        for name, default, _ in runtime.SMALL_TOO:
+            jax.config.update(name, default)
         runtime.cache_compilation(tmp_path / "runs")
         assert jax.config.jax_compilation_cache_dir.startswith(str(tmp_path / "runs"))
         for name, _, ours in runtime.SMALL_TOO:
