@@ -49,6 +49,11 @@ def import_data(settings: Any) -> None:
     """Run ``data import``."""
     from pewm_jax.data import importer
 
+    if isinstance(settings, FormerImport) and settings.intrinsics is None:
+        raise ConfigError(
+            "--intrinsics is missing (fx fy cx cy in pixels of the recorded images); see "
+            "`pewm-jax data import --help`."
+        )
     importer.import_recording(settings)
     if isinstance(settings, FormerImport):
         print(

@@ -66,7 +66,7 @@ class _Listed:
 def plan(entries: Sequence[Entry], config: ImportConfig) -> dict[Path, list[Part]]:
     """Return the episodes of each file: long sequences are cut, short ones share a file."""
     width, height = config.size or entries[0].open().size
-    longest = max(FEWEST_FRAMES, min(config.episode_frames, PIXELS // (width * height)))
+    longest = min(config.episode_frames, max(FEWEST_FRAMES, PIXELS // (width * height)))
     settings = dataclasses.asdict(config)
     for name in ("out", "split", "overwrite", "check", "skip_bad", "names", "src"):
         del settings[name]

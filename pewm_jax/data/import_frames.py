@@ -147,7 +147,7 @@ class RecordMaker:
             UserError: too many frames are damaged, or the episode does not pass the checks.
         """
         seen = self._open(part)
-        known = np.isfinite(seen.pose_T44).all((1, 2))
+        known = ~_lost(seen.pose_T44)
         self.bad.lost += [seen.raw.labels(k) for k in part.frames if not known[k]]
         numbers = [k for k in part.frames if known[k]]
         for k in [k for k in numbers if k in seen.raw.faults]:
@@ -176,18 +176,25 @@ class RecordMaker:
     def _poses(self, pose: np.ndarray) -> tuple[np.ndarray, int]:
         """Return the poses in our world and convention, and the quarter turns of the images."""
         config, known = self.config, np.isfinite(pose).all((1, 2))
+        pose[_lost(pose)] = np.nan
+        whole = pose[known]
         if config.invert_poses:
-            whole = np.abs(np.linalg.det(pose[known])) > 0.1  # others are refused later
-            pose[np.flatnonzero(known)[whole]] = np.linalg.inv(pose[known][whole])
+            rigid = np.abs(np.linalg.det(whole)) > 0.1  # others are refused later
+            whole[rigid] = np.linalg.inv(whole[rigid])
         if config.camera_axes == "opengl":
-            pose = pose @ OPENGL
-        pose = world_from_recording(config.up or self.found.UP) @ pose
-        pose[~known] = np.nan
+            whole = whole @ OPENGL
+        whole = self._world @ whole
         if config.rotate != "auto":
             turns = int(config.rotate) // 90
         else:
-            turns = turns_upright(pose) if self.found.SIDEWAYS else 0
-        return turn_poses(pose, turns), turns
+            turns = turns_upright(whole) if self.found.SIDEWAYS else 0
+        pose[known] = turn_poses(whole, turns)
+        return pose, turns
+
+    @property
+    def _world(self) -> np.ndarray:
+        """The (4, 4) rotation from the recording's world to ours."""
+        return world_from_recording(self.config.up or self.found.UP)
 
     def _intrinsics(self, raw: RawSequence) -> np.ndarray:
         """Return the intrinsics of the recorded colour images, centres at +0.5."""
@@ -239,7 +246,8 @@ class RecordMaker:
         stored, per_metre = _to_store(depth, seen.scale, self.config.max_depth)
         if looked_at and self.check is not None:
             metres = stored / np.float32(per_metre)
-            self.check.add(seen.pose_T44[number], fit.intrinsics(focal), colours, metres)
+            frame = (fit.intrinsics(focal), colours, metres)
+            self.check.add(seen.pose_T44[number], *frame, world_44=self._world, turns=fit.turns)
         return _Encoded(number, encode_png(colours), encode_png(stored), per_metre, thumb)
 
     def _record(self, part: Part, seen: _Opened, frames: list[_Encoded]) -> bytes:
@@ -255,7 +263,7 @@ class RecordMaker:
             thumbs[~(thumbs <= config.max_depth)] = 0
         voxels: VoxelFrames | None = None
         if raw.voxels is not None:
-            voxels = raw.voxels(numbers, world_from_recording(config.up or self.found.UP))
+            voxels = raw.voxels(numbers, self._world)
         actions = _actions(raw, part, numbers, pose)
         if actions is not None:
             self.moves = "planar actions" if actions.shape[1] == PLANAR else "recorded actions"
@@ -319,6 +327,14 @@ def _assumed(size: tuple[int, int]) -> np.ndarray:
     """Return the intrinsics of a camera with 90 degrees across the width."""
     width, height = size
     return np.array([width / 2, width / 2, width / 2, height / 2])
+
+
+def _lost(pose_T44: np.ndarray) -> np.ndarray:
+    """Return which poses (T,) have no finite number in their first three rows.
+
+    Those with some are wrong rather than lost: the checks refuse them.
+    """
+    return ~np.isfinite(pose_T44[:, :3]).any((1, 2))
 
 
 def _checked(picture: Picture, seen: _Opened, number: int) -> Picture:

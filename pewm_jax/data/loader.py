@@ -252,7 +252,7 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
             continue
         _check_size(config, first)
         _check_actions(config, first)
-        require_recorded(config.model, source)
+        require_recorded(config.model, source, first)
         require_same_cells(config.model, first)
         choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
         return first
@@ -324,16 +324,16 @@ def _check_actions(config: Config, episode: Episode) -> None:
             )
 
 
-def require_recorded(task: Task, source: EpisodeSource) -> None:
+def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = None) -> None:
     """Raise ConfigError if a world or a policy needs depth or poses that some episodes lack.
 
-    ``import`` lists which have depth; of other splits the first episode decides.
+    ``import`` lists which have depth; of other splits the first episode decides, or ``first``.
     """
     spec, name = task.batch_spec, type(task).__name__
     listed = source.manifest.settings.get("depth", {None: True})
     if not (spec.depth or spec.poses):
         return
-    first = source[0]
+    first = first or source[0]
     if spec.depth and not (first.has_depth and all(listed.values())):
         raise ConfigError(
             f"{source.path} has episodes without depth, and {name} needs it, for its memory or "

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from pewm_jax.data.checks import depth_between
+from pewm_jax.data.fit import turn_poses
 from pewm_jax.io import atomic
 
 KEPT = 16
@@ -41,9 +42,16 @@ CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 @dataclasses.dataclass(frozen=True)
 class _Kept:
     pose_44: np.ndarray
+    world_44: np.ndarray
+    turn_44: np.ndarray
     intrinsics_4: np.ndarray
     rgb_HWC: np.ndarray
     depth_HW: np.ndarray
+
+    def under(self, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Return the pose if those of the files had another convention."""
+        in_file = np.linalg.inv(self.world_44) @ self.pose_44 @ np.linalg.inv(self.turn_44)
+        return self.world_44 @ convert(in_file) @ self.turn_44
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,15 +77,28 @@ class PoseCheck:
         return {numbers[round(k)] for k in np.linspace(0, len(numbers) - 1, count)}
 
     def add(
-        self, pose_44: np.ndarray, intrinsics_4: np.ndarray, bgr: np.ndarray, depth: np.ndarray
+        self,
+        pose_44: np.ndarray,
+        intrinsics_4: np.ndarray,
+        bgr: np.ndarray,
+        depth: np.ndarray,
+        *,
+        world_44: np.ndarray,
+        turns: int = 0,
     ) -> None:
-        """Keep a frame: camera-to-world pose, intrinsics, colours and depth (H, W) in metres."""
+        """Keep a frame: camera-to-world pose, intrinsics, colours and depth (H, W) in metres.
+
+        ``world_44`` is the rotation from the recording's world to ours, ``turns`` are the quarter
+        turns clockwise of the images.
+        """
         step = max(1, -(-max(depth.shape) // SIDE))
         first = step // 2 + 0.5
         small = np.asarray(intrinsics_4, np.float64) / step
         small[2:] += 0.5 - first / step
         cut = (slice(step // 2, None, step),) * 2
-        one = _Kept(np.array(pose_44), small, bgr[cut][..., ::-1].copy(), depth[cut].copy())
+        turn = turn_poses(np.eye(4)[None], turns)[0]
+        images = bgr[cut][..., ::-1].copy(), depth[cut].copy()
+        one = _Kept(np.array(pose_44), world_44, turn, small, *images)
         with self._lock:
             self._kept.append(one)
 
@@ -108,7 +129,7 @@ class PoseCheck:
             "the images."
         )
         for name, convert in CONVENTIONS.items():
-            other = self._pairs([convert(pose) for pose in poses])
+            other = self._pairs([one.under(convert) for one in self._kept])
             if len(other) >= min(3, len(pairs)) and _median(other)[1] < share / 2:
                 metres, other_share = _median(other)
                 log(

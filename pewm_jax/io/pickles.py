@@ -181,6 +181,13 @@ def _from_buffer(raw: Any, dtype: Any, shape: Any, order: Any, *_: Any) -> _Arra
     return made
 
 
+def _bytes_of(text: Any, encoding: Any) -> bytes:
+    """Return the bytes that pickles of protocol 2 store as text."""
+    if not isinstance(text, str) or encoding != "latin1":
+        raise pickle.UnpicklingError("it encodes something else than bytes")
+    return text.encode("latin1")
+
+
 _NAMES: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
@@ -188,6 +195,7 @@ _NAMES: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy._core.multiarray", "_reconstruct"): lambda *_: _Array(),
     ("numpy.core.numeric", "_frombuffer"): _from_buffer,
     ("numpy._core.numeric", "_frombuffer"): _from_buffer,
+    ("_codecs", "encode"): _bytes_of,
     ("collections", "OrderedDict"): lambda *_: _Table(),
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,

@@ -53,7 +53,8 @@ def hand_held(frames=12, width=64, height=48, focal=None, turns=0):
 
 def image(path, rgb):
     path.parent.mkdir(parents=True, exist_ok=True)
-    assert cv2.imwrite(str(path), rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])
+    fine = [cv2.IMWRITE_JPEG_QUALITY, 98] if path.suffix == ".jpg" else []
+    assert cv2.imwrite(str(path), rgb[..., ::-1], fine)
 
 
 def depth_image(path, metres, scale):

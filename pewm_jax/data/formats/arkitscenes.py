@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from pewm_jax.config import UserError
 from pewm_jax.data.formats.options import ImportConfig
+from pewm_jax.data.formats.posed_files import TOLERANCE_S, by_time, matched, nearest
 from pewm_jax.data.formats.reader import (
     BadFrameError,
     Entry,
@@ -33,9 +34,6 @@ from pewm_jax.data.formats.reader import (
     read_table,
 )
 from pewm_jax.registry import register
-
-TOLERANCE_S = 0.006
-"""Largest difference in time between an image and its pose, depth or intrinsics, seconds."""
 
 
 @register("format", "arkitscenes")
@@ -56,10 +54,10 @@ class ARKitScenes(FolderFormat):
 
     def entry(self, folder: Path, options: ImportConfig) -> Entry:
         """Return the sequence of one scan; its frames are the colour images."""
-        images = _by_time(folder / "lowres_wide", ".png")
+        images = by_time(folder / "lowres_wide", ".png")
         trajectory = read_table(_trajectory(folder), 7)
         times = np.array(sorted(images))
-        _, has_pose = _nearest(times, trajectory[:, 0])
+        _, has_pose = nearest(times, trajectory[:, 0])
         if has_pose.mean() < 0.6 and len(times):  # images at 60 Hz, poses at 10 Hz
             times = times[has_pose]
         name = folder.resolve().name.removesuffix("_frames")
@@ -77,7 +75,7 @@ def _open(
 ) -> RawSequence:
     colours = [images[time] for time in times]
     depths, cameras, trust = (
-        _matched(folder / name, end, times)
+        matched(folder / name, end, times)
         for name, end in (
             ("lowres_depth", ".png"),
             ("lowres_wide_intrinsics", ".pincam"),
@@ -126,38 +124,10 @@ def _trajectory(folder: Path) -> Path:
     raise UserError(f"{folder} has no .traj file; it has the poses of lowres_wide/.")
 
 
-def _by_time(folder: Path, end: str) -> dict[float, Path]:
-    """Return files by the time in their names, ``SCAN_TIME.png``."""
-    found = {}
-    for path in folder.iterdir() if folder.is_dir() else ():
-        time = path.name.removesuffix(end).rpartition("_")[2]
-        if path.name.endswith(end) and time.replace(".", "", 1).isdecimal():
-            found[float(time)] = path
-    return found
-
-
-def _matched(folder: Path, end: str, times: np.ndarray) -> list[Path | None]:
-    """Return the file of each time, None if none is near."""
-    files = _by_time(folder, end)
-    there = np.array(sorted(files))
-    index, fits = _nearest(times, there)
-    return [files[there[i]] if fit else None for i, fit in zip(index, fits, strict=True)]
-
-
-def _nearest(times: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the position of the nearest of increasing times, and whether it is near enough."""
-    if not len(there):
-        return np.zeros(len(times), int), np.zeros(len(times), bool)
-    right = np.searchsorted(there, times).clip(0, len(there) - 1)
-    left = (right - 1).clip(0)
-    index = np.where(np.abs(there[left] - times) < np.abs(there[right] - times), left, right)
-    return index, np.abs(there[index] - times) <= TOLERANCE_S
-
-
 def _poses(times: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
     """Return camera-to-world poses (T, 4, 4), not a number where the trajectory has none."""
     order = trajectory[np.argsort(trajectory[:, 0], kind="stable")]
-    index, fits = _nearest(times, order[:, 0])
+    index, fits = nearest(times, order[:, 0])
     rows = order[index, 1:]
     fits &= np.isfinite(rows).all(1)
     pose = np.full((len(times), 4, 4), np.nan)

@@ -15,11 +15,10 @@ from typing import Any, ClassVar
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from pewm_jax.config import UserError
 from pewm_jax.data.formats import video
-from pewm_jax.data.formats.lerobot_meta import INFO, Meta, Row
+from pewm_jax.data.formats.lerobot_features import INFO, Features, focal_of, poses_of
+from pewm_jax.data.formats.lerobot_tables import Row, Tables
 from pewm_jax.data.formats.options import ImportConfig
 from pewm_jax.data.formats.reader import (
     BadFrameError,
@@ -30,7 +29,6 @@ from pewm_jax.data.formats.reader import (
     RawSequence,
     decode_image,
 )
-from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.registry import register
 
 
@@ -51,11 +49,12 @@ class LeRobot(Format):
 
     def entries(self, options: ImportConfig) -> list[Entry]:
         """Return the episodes."""
-        meta = Meta(options.src)
-        seen = _Cameras(meta, options)
+        features = Features(options.src)
+        tables = Tables(options.src, features)
+        seen = _Cameras(features, tables, options)
         return [
             Entry(f"episode_{row.index:06d}", row.length, functools.partial(seen.open, row))
-            for row in meta.episodes([key for key in (seen.colour, seen.depth) if key])
+            for row in tables.episodes([key for key in (seen.colour, seen.depth) if key])
         ]
 
 
@@ -63,7 +62,8 @@ class LeRobot(Format):
 class _Cameras:
     """The features of a data set that are imported."""
 
-    meta: Meta
+    meta: Features
+    tables: Tables
     options: ImportConfig
 
     def __post_init__(self) -> None:
@@ -76,15 +76,15 @@ class _Cameras:
         """Return the sequence of one episode."""
         columns = [c for c in (self.pose, self.intrinsics, self.meta.action) if c]
         images = [c for c in (self.colour, self.depth) if c and not self.meta.is_video(c)]
-        table = self.meta.rows(row, [*columns, "timestamp"])
-        size = self.meta.image_size(row, self.colour)
+        table = self.tables.rows(row, [*columns, "timestamp"])
+        size = self.tables.image_size(row, self.colour)
         actions = table.get(self.meta.action or "")
         scale = None
         if self.depth:
             scale = self.meta.depth_codes(self.depth)[1]
         known = self.meta.fixed_intrinsics(self.colour)
         if self.intrinsics:
-            known = _focal(table[self.intrinsics][0])
+            known = focal_of(table[self.intrinsics][0])
         note = (
             f"the poses are those of the feature {self.pose}"
             if self.pose
@@ -94,7 +94,7 @@ class _Cameras:
             )
         )
         return RawSequence(
-            None if self.pose is None else _poses(table[self.pose], self.pose),
+            None if self.pose is None else poses_of(table[self.pose], self.pose),
             known,
             size,
             functools.partial(self._read, row, table["timestamp"], images),
@@ -109,7 +109,7 @@ class _Cameras:
         self, row: Row, stamps: np.ndarray, images: list[str], chosen: Sequence[int]
     ) -> Iterator[Load]:
         """Yield a loader per frame; videos are decoded here, in order."""
-        stored = self.meta.rows(row, images) if images else {}
+        stored = self.tables.rows(row, images) if images else {}
         streams: list[Iterator[Any]] = []
         for key in (self.colour, self.depth):
             if key is None:
@@ -139,32 +139,3 @@ class _Cameras:
             return Picture(image, decoded(depth, cv2.IMREAD_UNCHANGED))
         codes = depth.to_ndarray(format="gray12le")
         return Picture(image, self.meta.depth_codes(self.depth)[0][codes.clip(0, 4095)])
-
-
-def _focal(values: np.ndarray) -> np.ndarray:
-    """Return fx, fy, cx, cy of 4 numbers, or of a 3×3 matrix."""
-    flat = np.asarray(values, np.float64).reshape(-1)
-    return flat if len(flat) == 4 else flat[[0, 4, 2, 5]]
-
-
-def _poses(values: np.ndarray, name: str) -> np.ndarray:
-    """Return camera-to-world poses (T, 4, 4) of 16, 12, 7 or 3 numbers per frame."""
-    rows = np.asarray(values, np.float64).reshape(len(values), -1)
-    pose = np.tile(np.eye(4), (len(rows), 1, 1))
-    known = np.isfinite(rows).all(1)
-    pose[~known] = np.nan
-    count = rows.shape[1]
-    if count in (12, 16):
-        pose[known, : count // 4] = rows[known].reshape(-1, count // 4, 4)
-    elif count == 7:
-        pose[known, :3, 3] = rows[known, :3]
-        pose[known, :3, :3] = Rotation.from_quat(rows[known, 3:]).as_matrix()
-    elif count == 3:
-        for k in np.flatnonzero(known):
-            pose[k] = pose_from_yaw(np.array([*rows[k, :2], 0.0]), float(rows[k, 2]))
-    else:
-        raise UserError(
-            f"--pose {name} has {count} numbers per frame: a pose has 16 or 12 (a matrix, row by "
-            "row), 7 (xyz, quaternion xyzw) or 3 (x, y, yaw)."
-        )
-    return pose

@@ -1,4 +1,4 @@
-"""Sequences whose frames are files with a number in their names: colours, depth, perhaps a pose."""
+"""Sequences whose frames are files with a number or a time in their names."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from pewm_jax.data.formats.reader import (
     read_depth,
     read_numbers,
 )
+
+TOLERANCE_S = 0.006
+"""Largest difference in time between the files of one frame, seconds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,3 +114,31 @@ class PosedFiles:
                 except BadFrameError as error:
                     faults[k] = str(error)
         return found
+
+
+def by_time(folder: Path, end: str) -> dict[float, Path]:
+    """Return files by the time in their names, ``SCAN_TIME.png``."""
+    found = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
+        time = path.name.removesuffix(end).rpartition("_")[2]
+        if path.name.endswith(end) and time.replace(".", "", 1).isdecimal():
+            found[float(time)] = path
+    return found
+
+
+def matched(folder: Path, end: str, times: np.ndarray) -> list[Path | None]:
+    """Return the file of each time, None if none is near."""
+    files = by_time(folder, end)
+    there = np.array(sorted(files))
+    index, fits = nearest(times, there)
+    return [files[there[i]] if fit else None for i, fit in zip(index, fits, strict=True)]
+
+
+def nearest(times: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position of the nearest of increasing times, and whether it is near enough."""
+    if not len(there):
+        return np.zeros(len(times), int), np.zeros(len(times), bool)
+    right = np.searchsorted(there, times).clip(0, len(there) - 1)
+    left = (right - 1).clip(0)
+    index = np.where(np.abs(there[left] - times) < np.abs(there[right] - times), left, right)
+    return index, np.abs(there[index] - times) <= TOLERANCE_S

@@ -271,7 +271,7 @@ def _is_whole(code: bytes) -> bool:
 
 
 def read_numbers(path: Path, count: int, separator: str | None = None) -> np.ndarray:
-    """Read a text file of exactly ``count`` numbers; ``nan`` and ``inf`` are numbers.
+    """Read a text file of exactly ``count`` numbers; ``nan``, ``inf`` and ``-1.#INF`` are numbers.
 
     Raises:
         BadFrameError: the file is missing or has something else.
@@ -282,7 +282,7 @@ def read_numbers(path: Path, count: int, separator: str | None = None) -> np.nda
         raise BadFrameError(f"{path} cannot be read as text ({type(error).__name__}).") from None
     words = text.replace(separator, " ").split() if separator else text.split()
     try:
-        values = np.array([float(word) for word in words])
+        values = np.array([np.nan if "#" in word else float(word) for word in words])
     except ValueError:
         values = np.empty(0)
     if len(values) != count:

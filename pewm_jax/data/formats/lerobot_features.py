@@ -1,44 +1,29 @@
-"""The tables of a LeRobot data set, version 3: features, episodes, rows; read with pyarrow."""
+"""The features of a LeRobot data set, version 3: cameras, depth, pose, intrinsics, actions."""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import json
 import math
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pewm_jax.config import ConfigError, UserError
-from pewm_jax.data.episodes import SATURATED, decode_image
-from pewm_jax.data.formats import video
+from pewm_jax.data.episodes import SATURATED
+from pewm_jax.geometry.cameras import pose_from_yaw
 
 INFO = "meta/info.json"
 CODES = 4096
 """Number of depth codes; the lowest and the highest are no measurement."""
 POSES = ("world_from_camera", "camera_to_world", "camera_pose", "pose")
 """Ends of the names of features that hold the camera's pose."""
-DEFAULT_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-DEFAULT_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 
 
-@dataclasses.dataclass(frozen=True)
-class Row:
-    """One episode: number, frames, task, file of its rows, file and start time of each video."""
-
-    index: int
-    length: int
-    task: str
-    data: Path
-    videos: Mapping[str, tuple[Path, float]]
-
-
-class Meta:
-    """The features of a data set; UserError for a damaged file or another version."""
+class Features:
+    """The features that ``info.json`` lists; UserError for a damaged file or another version."""
 
     def __init__(self, root: Path):
         self.root = root
@@ -147,90 +132,31 @@ class Meta:
         stored[[0, -1]] = 0
         return stored.astype(np.uint16), per_metre
 
-    def episodes(self, cameras: Sequence[str]) -> list[Row]:
-        """Return the episodes in order, with the files that hold them."""
-        paths = sorted((self.root / "meta" / "episodes").rglob("*.parquet"))
-        if not paths:
-            raise UserError(f"{self.root / 'meta' / 'episodes'} has no .parquet file.")
-        keys = [key for key in cameras if self.is_video(key)]
-        parts = [
-            f"videos/{k}/{n}" for k in keys for n in ("chunk_index", "file_index", "from_timestamp")
-        ]
-        names = ["episode_index", "length", "data/chunk_index", "data/file_index", *parts]
-        found = []
-        for path in paths:
-            table = _table(path, names, optional=("tasks",))
-            found += [self._row(one, keys) for one in table.to_pylist()]
-        return sorted(found, key=lambda row: row.index)
 
-    def _row(self, one: dict[str, Any], keys: Sequence[str]) -> Row:
-        def path(kind: str, start: str, default: str, **more: str) -> Path:
-            numbers = {n: one[f"{start}/{n}"] for n in ("chunk_index", "file_index")}
-            return self.root / (self.info.get(kind) or default).format(**numbers, **more)
-
-        videos = {
-            key: (
-                path("video_path", f"videos/{key}", DEFAULT_VIDEO, video_key=key),
-                float(one[f"videos/{key}/from_timestamp"]),
-            )
-            for key in keys
-        }
-        tasks = one.get("tasks") or [""]
-        task = tasks if isinstance(tasks, str) else str(tasks[0])
-        data = path("data_path", "data", DEFAULT_DATA)
-        return Row(int(one["episode_index"]), int(one["length"]), task, data, videos)
-
-    def rows(self, row: Row, columns: Sequence[str]) -> dict[str, Any]:
-        """Return columns of an episode's rows by name: arrays (T, …), or T encoded images."""
-        wanted = list(dict.fromkeys(columns))
-        table = _table(row.data, [*wanted, "frame_index"], episode=row.index)
-        table = table.sort_by("frame_index")
-        if len(table) != row.length:
-            raise UserError(
-                f"{row.data} has {len(table)} rows of episode {row.index}, but meta/episodes lists "
-                f"{row.length}: the data set is incomplete, copy it again."
-            )
-        return {name: self._column(table[name].to_pylist(), name) for name in wanted}
-
-    def _column(self, values: list[Any], name: str) -> Any:
-        if self.features.get(name, {}).get("dtype") == "image":
-            return [
-                one["bytes"] or (self.root / one["path"]).read_bytes()
-                if isinstance(one, dict)
-                else one
-                for one in values
-            ]
-        return np.array(values, np.float64)
-
-    def image_size(self, row: Row, key: str) -> tuple[int, int]:
-        """Return width and height of a camera's images."""
-        if self.is_video(key):
-            return video.video_size(row.videos[key][0])
-        image = decode_image(self.rows(row, [key])[key][0], cv2.IMREAD_COLOR)
-        if image is None:
-            raise UserError(f"{row.data}: the first image of {key} does not decode.")
-        return image.shape[1], image.shape[0]
+def focal_of(values: np.ndarray) -> np.ndarray:
+    """Return fx, fy, cx, cy of 4 numbers, or of a 3×3 matrix."""
+    flat = np.asarray(values, np.float64).reshape(-1)
+    return flat if len(flat) == 4 else flat[[0, 4, 2, 5]]
 
 
-def _table(
-    path: Path, columns: Sequence[str], *, optional: Sequence[str] = (), episode: int = -1
-) -> Any:
-    """Read columns of a Parquet file, of one episode or of all."""
-    try:
-        import pyarrow as pa  # noqa: PLC0415 - optional
-        from pyarrow import parquet  # noqa: PLC0415
-    except ImportError:
+def poses_of(values: np.ndarray, name: str) -> np.ndarray:
+    """Return camera-to-world poses (T, 4, 4) of 16, 12, 7 or 3 numbers per frame."""
+    rows = np.asarray(values, np.float64).reshape(len(values), -1)
+    pose = np.tile(np.eye(4), (len(rows), 1, 1))
+    known = np.isfinite(rows).all(1)
+    pose[~known] = np.nan
+    count = rows.shape[1]
+    if count in (12, 16):
+        pose[known, : count // 4] = rows[known].reshape(-1, count // 4, 4)
+    elif count == 7:
+        pose[known, :3, 3] = rows[known, :3]
+        pose[known, :3, :3] = Rotation.from_quat(rows[known, 3:]).as_matrix()
+    elif count == 3:
+        for k in np.flatnonzero(known):
+            pose[k] = pose_from_yaw(np.array([*rows[k, :2], 0.0]), float(rows[k, 2]))
+    else:
         raise UserError(
-            "LeRobot's tables need pyarrow: install it with `pip install 'pewm-jax[lerobot]'`."
-        ) from None
-    try:
-        known = parquet.read_schema(path).names
-        missing = [name for name in columns if name not in known]
-        if missing:
-            raise UserError(f"{path} has no column {missing[0]}; the data set is damaged.")
-        chosen = [*columns, *(name for name in optional if name in known)]
-        rows = None if episode < 0 else [("episode_index", "==", episode)]
-        return parquet.read_table(path, columns=chosen, filters=rows)
-    except (OSError, pa.ArrowException) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise UserError(f"{path} cannot be read as Parquet ({reason}); copy it again.") from None
+            f"--pose {name} has {count} numbers per frame: a pose has 16 or 12 (a matrix, row by "
+            "row), 7 (xyz, quaternion xyzw) or 3 (x, y, yaw)."
+        )
+    return pose
