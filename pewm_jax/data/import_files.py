@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import itertools
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,7 @@ from pewm_jax.data.formats.reader import Entry
 from pewm_jax.data.voxels import VoxelGrid, require_alike
 from pewm_jax.io.progress import Meter
 
-PIXELS = 160_000_000
+PIXELS = 120_000_000
 """Largest number of pixels of an episode: its encoded images are in memory at once."""
 FEWEST_FRAMES = 16
 FILES = 256
@@ -126,16 +127,16 @@ class ImportFiles:
 
     def write(self, path: Path, records: Iterator[bytes]) -> None:
         """Write a file of one record or more; none if there are no records."""
-        first = next(records, None)
+        first = list(itertools.islice(records, 1))
         self.done[path] = None
-        if first is None:
+        if not first:
             path.unlink(missing_ok=True)
             return
 
         def every() -> Iterator[bytes]:
-            yield self._alike(first, path)
+            yield self._alike(first.pop())
             for record in records:
-                yield self._alike(record, path)
+                yield self._alike(record)
 
         self.done[path] = _inspect(path, dataset.write_shard(path, every()))
 
@@ -258,7 +259,7 @@ class ImportFiles:
                 whole.append(_inspect(path, dataset.describe_shard(path)))
         return whole
 
-    def _alike(self, record: bytes, path: Path) -> bytes:
+    def _alike(self, record: bytes) -> bytes:
         """Return a record; UserError if its voxels are not like those of the split."""
         grid = read_episode(record).voxel_grid
         there = next((one for one in self.others if one.voxels), None)
@@ -267,7 +268,6 @@ class ImportFiles:
             known = read_episode(dataset.read_record(other, 0), str(other)).voxel_grid
             assert isinstance(known, VoxelGrid)
             require_alike(known, grid, str(self.config.src / "voxels"))
-        del path
         return record
 
 

@@ -157,7 +157,9 @@ class RecordMaker:
         frames = list(self._encoded(seen, numbers, meter))
         if frames:
             self.made = seen.fit.target
-            yield self._record(part, seen, frames)
+            record = self._record(part, seen, frames)
+            frames.clear()  # the record has a copy
+            yield record
 
     def _open(self, part: Part) -> _Opened:
         if self._last is None or self._last[0] is not part.entry:  # parts of one are consecutive
