@@ -71,7 +71,8 @@ def config(model, path):
     settings = presets.load("tiny")
     clip = dataclasses.replace(model.clip, height=SIZE, width=SIZE)
     data = dataclasses.replace(settings.data, path=str(path), stride_max=1, context=2)
-    return dataclasses.replace(settings, model=dataclasses.replace(model, clip=clip), data=data)
+    model = dataclasses.replace(model, clip=clip)
+    return dataclasses.replace(settings, model=model, data=data, train=model.TRAIN())
 
 
 def without_depth():
