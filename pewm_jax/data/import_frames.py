@@ -82,6 +82,7 @@ class _Encoded:
         rgb, depth: PNG images.
         per_metre: stored value of one metre.
         metres_hw: depth on every n-th pixel, for the checks.
+        depth_size: width and height of the recorded depth image.
         fault: why the frame cannot be used.
     """
 
@@ -90,6 +91,7 @@ class _Encoded:
     depth: bytes | None = None
     per_metre: float = MILLIMETRES
     metres_hw: np.ndarray | None = None
+    depth_size: tuple[int, ...] = ()
     fault: str = ""
 
 
@@ -224,11 +226,16 @@ class RecordMaker:
                 return _Encoded(number, fault=str(error))
             return self._encode(seen, number, picture, number in chosen)
 
+        size: tuple[int, ...] | None = None
         for one in _in_threads(encoded, zip(numbers, seen.raw.read(numbers), strict=True)):
             meter.advance(1)
-            if one.fault:
-                self.bad.add(one.fault)
+            fault = one.fault
+            if not fault and one.depth_size != (size or one.depth_size):
+                fault = _another_size(seen.raw.labels(one.number), one.depth_size, size, " (depth)")
+            if fault:
+                self.bad.add(fault)
             else:
+                size = one.depth_size
                 yield one
 
     def _encode(self, seen: _Opened, number: int, picture: Picture, looked_at: bool) -> _Encoded:
@@ -239,7 +246,7 @@ class RecordMaker:
         colours, depth = fit.colours(image), picture.depth_HW
         if depth is None or seen.scale is None:
             return _Encoded(number, encode_png(colours))
-        depth_4 = picture.depth_intrinsics_4
+        depth_4, recorded = picture.depth_intrinsics_4, depth.shape[::-1]
         if depth_4 is None and own is not None:
             depth_4 = own * np.tile(np.array(depth.shape[::-1]) / fit.source, 2)
         depth = fit.depth(depth, depth_4, focal)
@@ -250,7 +257,8 @@ class RecordMaker:
             metres = stored / np.float32(per_metre)
             frame = (fit.intrinsics(focal), colours, metres)
             self.check.add(seen.pose_T44[number], *frame, world_44=self._world, turns=fit.turns)
-        return _Encoded(number, encode_png(colours), encode_png(stored), per_metre, thumb)
+        images = encode_png(colours), encode_png(stored)
+        return _Encoded(number, *images, per_metre, thumb, recorded)
 
     def _record(self, part: Part, seen: _Opened, frames: list[_Encoded]) -> bytes:
         """Check an episode and return its record."""
@@ -343,11 +351,16 @@ def _checked(picture: Picture, seen: _Opened, number: int) -> Picture:
     """Return a frame; BadFrameError if it has another size than the first."""
     found, expected = picture.bgr_HWC.shape[1::-1], seen.raw.size
     if tuple(found) != tuple(expected):
-        raise BadFrameError(
-            f"{seen.raw.labels(number)} has {found[0]}×{found[1]} pixels, the first image "
-            f"{expected[0]}×{expected[1]}: all images of a sequence must have one size."
-        )
+        raise BadFrameError(_another_size(seen.raw.labels(number), found, expected))
     return picture
+
+
+def _another_size(where: str, found: Any, expected: Any, kind: str = "") -> str:
+    """Return the sentence about an image of another size, width and height."""
+    return (
+        f"{where}{kind} has {found[0]}×{found[1]} pixels, the first image {expected[0]}×"
+        f"{expected[1]}: all images of a sequence must have one size."
+    )
 
 
 def _metres(stored_hw: np.ndarray, scale: float) -> np.ndarray:

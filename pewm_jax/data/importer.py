@@ -38,7 +38,8 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
         log(f"{config.src}: recognised as {found.NAME}, because there is {why}.")
     else:
         found = formats.named(config.format)
-    config.require_used(found.USES)
+    known = found.USES if found.DEPTH_SCALE is None else (*found.USES, "depth_scale")
+    config.require_used(known, found.NAME)
     entries = _chosen(found.entries(config), config)
     frames = sum(-(-entry.frames // config.stride) for entry in entries)
     if not frames:

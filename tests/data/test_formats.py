@@ -346,3 +346,30 @@ def test_a_folder_of_several_scans_is_one_import(tmp_path):
     assert "2 episodes, 12 frames" in lines
     only, _ = imported(tmp_path / "chess" / "seq-02", tmp_path / "one")
     assert [episode.name for episode in only] == ["seq-02"]
+
+
+def test_a_depth_image_of_another_size_is_a_bad_frame(tmp_path):
+    src, _ = written(tmp_path, "7scenes")
+    shrink("*.depth.png", 5)(src)
+    with pytest.raises(UserError, match=r"color\.png \(depth\) has 8×8 pixels"):
+        imported(src, tmp_path / "out", "7scenes")
+    (episode,), _ = imported(src, tmp_path / "out", "7scenes", skip_bad=1)
+    assert episode.info["left_out"] == [5]
+
+
+def test_a_format_of_a_plugin_is_one_class(tmp_path):
+    from pewm_jax.data.formats.seven_scenes import SevenScenes
+    from pewm_jax.registry import _KINDS, register
+
+    class Mine(SevenScenes):
+        NAME = "mine"
+
+    import dataclasses
+
+    register("format", "mine", dataclasses.dataclass(frozen=True)(Mine))
+    try:
+        src, _ = written(tmp_path, "7scenes")
+        (episode,), _ = imported(src, tmp_path / "out", "mine")
+        assert episode.info["format"] == "mine"
+    finally:
+        del _KINDS["format", "mine"]

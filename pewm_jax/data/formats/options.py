@@ -14,7 +14,7 @@ from pewm_jax.data.episodes import DEPTH_LIMIT_M
 
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 OF_FORMATS = (
-    *("trajectory", "camera", "pose", "metres_per_step", "min_confidence"),
+    *("depth_scale", "trajectory", "camera", "pose", "metres_per_step", "min_confidence"),
     *("episodes", "fov", "camera_height", "frames", "step", "turn_deg"),
 )
 """Options that only some formats use; a format names those that it uses."""
@@ -141,12 +141,12 @@ class ImportConfig:
         """Name of the recording."""
         return self.name or self.src.resolve().name or "recording"
 
-    def require_used(self, used: tuple[str, ...]) -> None:
+    def require_used(self, used: tuple[str, ...], name_of_format: str) -> None:
         """Refuse an option that the format does not use; ``used`` are those that it uses."""
         defaults = {field.name: field.default for field in dataclasses.fields(self)}
         for name in OF_FORMATS:
             if name not in used and getattr(self, name) != defaults[name]:
                 flag = name.replace("_", "-")
                 raise ConfigError(
-                    f"--{flag} is not used by the format {self.format}; leave it out."
+                    f"--{flag} is not used by the format {name_of_format}; leave it out."
                 )
