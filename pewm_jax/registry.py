@@ -112,6 +112,18 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "flow": "pewm_jax.diffusion.flow:FlowConfig",
         "frame_flow": "pewm_jax.diffusion.flow:FrameFlowConfig",
     },
+    "format": {
+        "7scenes": "pewm_jax.data.formats.seven_scenes:SevenScenes",
+        "arkitscenes": "pewm_jax.data.formats.arkitscenes:ARKitScenes",
+        "habitat": "pewm_jax.data.formats.habitat:Habitat",
+        "lerobot": "pewm_jax.data.formats.lerobot:LeRobot",
+        "nomad": "pewm_jax.data.formats.nomad:NoMaD",
+        "open3d": "pewm_jax.data.formats.recording:Open3D",
+        "replica": "pewm_jax.data.formats.replica:Replica",
+        "scannet": "pewm_jax.data.formats.scannet:ScanNet",
+        "stray": "pewm_jax.data.formats.stray:Stray",
+        "tum": "pewm_jax.data.formats.recording:TUM",
+    },
 }
 """Section → name → "module:class" of the kinds of this package, imported when first used."""
 

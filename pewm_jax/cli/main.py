@@ -55,9 +55,10 @@ COMMANDS = {
         resumes=True,
     ),
     "data import": Command(
-        "import a recording: a folder of colour, depth and a trajectory",
-        "pewm_jax.data.importer:ImportConfig",
-        "pewm_jax.data.importer:import_recording",
+        "import recordings: scans, robots' data sets, simulators' episodes",
+        f"{CLI}.data:import_arguments",
+        f"{CLI}.data:import_data",
+        resumes=True,
     ),
     "data validate": Command(
         "check a dataset: files, counts, units, poses, geometry",

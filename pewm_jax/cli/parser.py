@@ -65,6 +65,7 @@ class Arguments:
         epilog: text after the help, printed verbatim.
         hint: the command whose ``--help`` lists the settings, for error messages.
         renamed: earlier names of flags, with the present ones.
+        argv: the words to parse in place of those typed; None for those.
     """
 
     groups: Mapping[str, tuple[type, Any]]
@@ -72,6 +73,7 @@ class Arguments:
     epilog: str = ""
     hint: str = ""
     renamed: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    argv: Sequence[str] | None = None
 
 
 def run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str] | None = None) -> int:
@@ -120,7 +122,8 @@ def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
         ConfigError: an unknown flag (with the nearest known one), an invalid value, or a missing
             argument.
     """
-    flags = [wanted.renamed.get(word, word) for word in argv]
+    words = argv if wanted.argv is None else wanted.argv
+    flags = [wanted.renamed.get(word, word) for word in words]
     groups = dict(wanted.groups)
     for name in (name for kind, _ in groups.values() for name in getattr(kind, "REPEATED", ())):
         flags = _joined(flags, name)

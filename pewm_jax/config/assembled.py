@@ -82,7 +82,8 @@ class AssembledModel(World):
         if self.memory.encoder.WEIGHTS == "encoder":
             shape = (*self.memory.encoder.grid(self.clip), self.memory.encoder.channels)
             features = ArraySpec(shape, "float16")
-        return BatchSpec(actions=self.control.actions, features=features)
+        depth = self.clip.depth or self.memory.REMEMBERS
+        return BatchSpec(actions=self.control.actions, features=features, depth=depth)
 
     @property
     def capabilities(self) -> Capabilities:

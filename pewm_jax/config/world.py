@@ -105,12 +105,16 @@ class BatchSpec:
             ``classes_TXYZ`` and ``origin_T3``; they are absent if the data do not have them.
         features: cached image features of one context frame, where ``data.features`` names a cache;
             None if the loss uses none.
+        depth: whether recorded depth is needed.
+        poses: whether the recorded poses of the camera are needed.
     """
 
     context: bool = True
     actions: int = 0
     extras: tuple[tuple[str, ArraySpec], ...] = ()
     features: ArraySpec | None = None
+    depth: bool = True
+    poses: bool = True
 
     @property
     def names(self) -> tuple[str, ...]:

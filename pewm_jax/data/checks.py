@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from pewm_jax.config import UserError
-from pewm_jax.data.episodes import MILLIMETRES, SATURATED, Episode
+from pewm_jax.data.episodes import SATURATED, Episode
 from pewm_jax.data.voxels import LOOKS, disagreement, measured_points, off_lattice, outside
 from pewm_jax.geometry.actions import PLANAR
 
@@ -57,6 +57,27 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
         episode: the episode to check.
         where: its file and record, for the messages.
     """
+    try:
+        depth_THW = episode.frames().depth_THW
+        if episode.has_ids:
+            episode.ids()
+    except UserError as error:
+        return [*check_motion(episode, None, where), Problem(where, None, "images", str(error))]
+    saturated = list(_check_saturation(episode, depth_THW))
+    usable = episode.has_depth and not saturated
+    found = check_motion(episode, depth_THW if usable else None, where)
+    if episode.has_depth:
+        cells = _check_voxels(episode, depth_THW)
+        found += [Problem(where, frame, "voxels", what) for frame, what in cells]
+        found += [Problem(where, frame, "depth", what) for frame, what in saturated]
+    return found
+
+
+def check_motion(episode: Episode, depth_THW: np.ndarray | None, where: str) -> list[Problem]:
+    """Check cameras and actions, and whether depth (T, H, W), if there is any, agrees with them.
+
+    The images of the episode are not decoded; the intrinsics are those of ``depth_THW``.
+    """
     found: list[Problem] = []
 
     def add(field: str, problems: Iterable[tuple[int | None, str]]) -> None:
@@ -64,17 +85,13 @@ def check_episode(episode: Episode, where: str) -> list[Problem]:
 
     add("intrinsics", _check_intrinsics(episode))
     add("world_from_camera", _check_poses(episode))
-    add("actions", _check_actions(episode))
-    try:
-        depth_THW = episode.frames().depth_THW
-        if episode.has_ids:
-            episode.ids()
-    except UserError as error:
-        add("images", [(None, str(error))])
+    posed = episode.info.get("poses") != "unknown"
+    if posed:
+        add("actions", _check_actions(episode))
+    if depth_THW is None:
         return found
-    add("voxels", _check_voxels(episode, depth_THW))
-    add("depth", [*_check_saturation(depth_THW)] or _check_units(depth_THW))
-    if not found and not episode.info.get("moving"):
+    add("depth", _check_units(depth_THW))
+    if not found and posed and not episode.info.get("moving"):
         # Wrong poses or units would only be reported again.
         add("depth", _check_geometry(episode, depth_THW))
     return found
@@ -140,9 +157,9 @@ def _check_units(depth_THW: np.ndarray) -> Found:
             return
 
 
-def _check_saturation(depth_THW: np.ndarray) -> Found:
+def _check_saturation(episode: Episode, depth_THW: np.ndarray) -> Found:
     """Check that no stored depth has the saturated value, which marks missing depth."""
-    saturated = depth_THW > (SATURATED - 0.5) / MILLIMETRES
+    saturated = depth_THW > (SATURATED - 0.5) / episode.depth_per_metre
     if saturated.any():
         what = (
             f"{saturated.mean():.1%} of the episode's pixels hold the saturated value {SATURATED}, "
@@ -318,13 +335,13 @@ def share_floating(
     safe = np.where(z > 0.1, z, 1.0)
     u, v = local[:, 0] / safe * fx + cx - 0.5, local[:, 1] / safe * fy + cy - 0.5
     inside = (z > 0.1) & (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
-    other, smooth = _depth_between(depth_THW[second], u[inside], v[inside])
+    other, smooth = depth_between(depth_THW[second], u[inside], v[inside])
     if smooth.sum() < max(20, LEAST_OVERLAP * len(points)):
         return None
     return float((z[inside][smooth] < (1 - FLOATING) * other[smooth]).mean())
 
 
-def _depth_between(
+def depth_between(
     depth_HW: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate depth between pixels, and return where it is reliable (no edge, no hole).

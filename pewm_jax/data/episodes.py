@@ -16,6 +16,8 @@ import numpy as np
 from pewm_jax.config import UserError
 from pewm_jax.data import voxels as voxel_frames
 from pewm_jax.data.record_format import (
+    FINE,
+    UNITS,
     DamagedError,
     array_shapes,
     check_span,
@@ -94,6 +96,17 @@ class Episode:
     record: bytes = dataclasses.field(repr=False)
 
     @property
+    def has_depth(self) -> bool:
+        """Whether depth was recorded; without it, ``frames`` returns 0 everywhere."""
+        return "depth" in self.header["streams"]
+
+    @property
+    def depth_per_metre(self) -> float:
+        """Value of a stored depth that means one metre."""
+        stream = self.header["streams"].get("depth", {})
+        return float(stream.get("per_metre", MILLIMETRES))
+
+    @property
     def has_ids(self) -> bool:
         """Whether instance ids were recorded."""
         return "ids" in self.header["streams"]
@@ -107,18 +120,19 @@ class Episode:
         """Decode some frames (all by default), in the order of ``indices``.
 
         Returns:
-            NumPy frames: rgb uint8, depth float32 in metres.
+            NumPy frames: rgb uint8, depth float32 in metres (0 everywhere if none was recorded).
 
         Raises:
             DamagedError: an image does not decode; the message names the frame.
         """
         chosen = self._chosen(indices)
         rgb = np.empty((len(chosen), self.height, self.width, 3), np.uint8)
-        depth = np.empty((len(chosen), self.height, self.width), np.float32)
+        depth = np.zeros((len(chosen), self.height, self.width), np.float32)
         for row, index in enumerate(chosen):
             rgb[row] = self._image("rgb", index)[..., ::-1]
-            depth[row] = self._image("depth", index)
-        depth /= MILLIMETRES
+            if self.has_depth:
+                depth[row] = self._image("depth", index)
+        depth /= self.depth_per_metre
         return Frames(rgb, depth, self.camera(chosen))
 
     def ids(self, indices: Sequence[int] | np.ndarray | None = None) -> np.ndarray:
@@ -185,24 +199,49 @@ def write_episode(
     """
     _check_arrays(arrays, name)
     streams: dict[str, list[bytes]] = {
-        "rgb": [_png(image[..., ::-1]) for image in arrays.rgb_THWC],
-        "depth": [_png(image) for image in to_millimetres(arrays.depth_THW)],
+        "rgb": [encode_png(image[..., ::-1]) for image in arrays.rgb_THWC],
+        "depth": [encode_png(image) for image in to_millimetres(arrays.depth_THW)],
     }
     if arrays.ids_THW is not None:
-        streams["ids"] = [_png((image + 1).astype(np.uint16)) for image in arrays.ids_THW]
+        streams["ids"] = [encode_png((image + 1).astype(np.uint16)) for image in arrays.ids_THW]
     about, voxels = {}, arrays.voxels
     if voxels is not None:
         streams["voxels"] = [voxel_frames.encode(grid) for grid in voxels.classes_TXYZ]
         about["voxels"] = voxel_frames.header_of(voxels)
     small = {
-        "intrinsics": (arrays.intrinsics_4, "<f4"),
-        "world_from_camera": (arrays.world_from_camera, "<f4"),
-        "actions": (arrays.actions, "<f4"),
-        "action_ids": (arrays.action_ids, "<i4"),
-        "voxel_origins": (None if voxels is None else voxels.origin_T3, "<f4"),
+        "intrinsics": arrays.intrinsics_4,
+        "world_from_camera": arrays.world_from_camera,
+        "actions": arrays.actions,
+        "action_ids": arrays.action_ids,
+        "voxel_origins": None if voxels is None else voxels.origin_T3,
     }
-    kept = {field: np.asarray(x, dtype) for field, (x, dtype) in small.items() if x is not None}
     header = new_header(name, scene, arrays.depth_THW.shape, info or {})
+    return pack_encoded(header, small, streams, about)
+
+
+def pack_encoded(
+    header: dict[str, Any],
+    small: Mapping[str, np.ndarray | None],
+    streams: Mapping[str, list[bytes]],
+    about: Mapping[str, dict[str, Any]] | None = None,
+) -> bytes:
+    """Return the record of an episode whose images are encoded already.
+
+    Args:
+        header: as of ``new_header``; it is changed.
+        small: arrays by the names of ``array_shapes``; None for one that the episode lacks.
+        streams: the encoded images of each frame; ``depth`` may be absent.
+        about: header entries of streams. That of ``depth`` may have ``per_metre``, the stored value
+            that means one metre, by default 1000.
+    """
+    types = {"action_ids": "<i4"}
+    kept = {
+        field: np.asarray(x, types.get(field, "<f4")) for field, x in small.items() if x is not None
+    }
+    per_metre = (about or {}).get("depth", {}).get("per_metre", MILLIMETRES)
+    if "depth" not in streams or per_metre != MILLIMETRES:
+        unit = f"1/{per_metre:g} metre on disk, metre once decoded"
+        header |= {"version": FINE, "units": UNITS | {"depth": unit}}
     return pack_record(header, kept, streams, about)
 
 
@@ -234,7 +273,8 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
         dtype, count = np.dtype(place["dtype"]), int(np.prod(shape))
         check_span(record, place["offset"], count * dtype.itemsize, where, field)
         arrays[field] = np.frombuffer(record, dtype, count, place["offset"]).reshape(shape).copy()
-    for stream in ("rgb", "depth", *header["streams"]):
+    required = ("rgb",) if header["version"] == FINE else ("rgb", "depth")
+    for stream in (*required, *header["streams"]):
         spans = header["streams"].get(stream, {"spans": []})["spans"]
         if len(spans) != frames:
             raise DamagedError(
@@ -268,7 +308,8 @@ def decode_image(code: bytes | memoryview, flags: int) -> np.ndarray | None:
         return None
 
 
-def _png(image: np.ndarray) -> bytes:
+def encode_png(image: np.ndarray) -> bytes:
+    """Return an image (BGR or one channel, 8 or 16 bits) as PNG."""
     done, code = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL])
     assert done
     return code.tobytes()

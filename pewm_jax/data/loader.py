@@ -19,7 +19,7 @@ import grain
 import numpy as np
 
 from pewm_jax.config import Config, ConfigError, UserError
-from pewm_jax.config.world import World
+from pewm_jax.config.world import Task, World
 from pewm_jax.data.clips import Choice, ReadFeatures, choose, cut, stack
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
@@ -252,6 +252,7 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
             continue
         _check_size(config, first)
         _check_actions(config, first)
+        require_recorded(config.model, source, first)
         require_same_cells(config.model, first)
         choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
         return first
@@ -321,6 +322,29 @@ def _check_actions(config: Config, episode: Episode) -> None:
                 f"episode {episode.name} was collected with {name} {made:g}, the configuration has "
                 f"actions.{name} {wanted:g}: set --actions.{name} {made:g}."
             )
+
+
+def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = None) -> None:
+    """Raise ConfigError if a world or a policy needs depth or poses that some episodes lack.
+
+    ``import`` lists which have depth; of other splits the first episode decides, or ``first``.
+    """
+    spec, name = task.batch_spec, type(task).__name__
+    listed = source.manifest.settings.get("depth", {None: True})
+    if not (spec.depth or spec.poses):
+        return
+    first = first or source[0]
+    if spec.depth and not (first.has_depth and all(listed.values())):
+        raise ConfigError(
+            f"{source.path} has episodes without depth, and {name} needs it, for its memory or "
+            "to generate it: import depth too, or use a world that needs none, such as egowm with "
+            "--clip.depth False, or nomad."
+        )
+    if spec.poses and first.info.get("poses") == "unknown":
+        raise ConfigError(
+            f"{source.path} has episodes whose camera poses are unknown, and {name} needs them: "
+            "import them with --pose, or use a world steered by actions, such as egowm."
+        )
 
 
 def require_same_cells(world: World, episode: Episode) -> None:

@@ -16,6 +16,8 @@ from pewm_jax.config import UserError
 
 MAGIC = b"PEWMEPIS"
 VERSION = 1
+FINE = 2
+"""Version of records without depth, or with depth in another unit than millimetres."""
 
 CONVENTIONS = {
     "camera": "OpenCV axes: x right, y down, z forward",
@@ -146,7 +148,7 @@ def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
     try:
         header = json.loads(record[start : start + length])
         version = header["version"]
-        if version == VERSION:
+        if version in (VERSION, FINE):
             required = new_header("", "", (0, 0, 0), {})
             header = _absolute({field: header[field] for field in required}, start + length)
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError):
@@ -154,9 +156,9 @@ def read_header(record: bytes, where: str = "record") -> dict[str, Any]:
             f"{where}: the episode's header does not parse; the record is damaged, collect or "
             "import it again."
         ) from None
-    if version != VERSION:
+    if version not in (VERSION, FINE):
         raise UserError(
-            f"{where} has format version {version}, this library reads version {VERSION}; "
-            "collect or import it again."
+            f"{where} has format version {version}, this library reads versions {VERSION} and "
+            f"{FINE}; collect or import it again."
         )
     return header

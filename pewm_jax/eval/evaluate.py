@@ -13,6 +13,7 @@ import jax
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
+from pewm_jax.data.loader import require_recorded
 from pewm_jax.eval import loaded_run as runs
 from pewm_jax.eval import reproject, results, steering
 from pewm_jax.eval.clips import ClipChoice, fingerprint
@@ -188,6 +189,7 @@ def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
     config, protocol = apply_protocol_file(override(loaded.config, **changes), changes)
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
+    require_recorded(config.model, episodes)
     none = runs.open_none(loaded, config)
     data_hash = file_hash(split / MANIFEST)
     metrics = select_metrics(

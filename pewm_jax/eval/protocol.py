@@ -23,6 +23,7 @@ import pewm_jax
 from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
+from pewm_jax.data.loader import require_recorded
 from pewm_jax.eval.clips import VERSION, ClipChoice, choose, long_choices, needs_cameras
 from pewm_jax.io import atomic
 
@@ -328,6 +329,7 @@ def write_protocol(config: Config, path: Path, log: Callable[[str], Any]) -> Pro
     """
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
+    require_recorded(config.model, episodes)
     protocol = make_protocol(config, episodes, *choose_clips(config, episodes))
     if path.exists():
         other = difference(load_protocol(path), protocol)

@@ -172,11 +172,30 @@ def _require_arrays(found: Any) -> Tensors:
     return made
 
 
+def _from_buffer(raw: Any, dtype: Any, shape: Any, order: Any, *_: Any) -> _Array:
+    """Return an array that protocol 5 of pickle stores as a buffer."""
+    if not (isinstance(dtype, _Dtype) and isinstance(raw, bytes | bytearray)):
+        raise pickle.UnpicklingError("an array is not stored as raw bytes")
+    made = _Array()
+    made.array = np.frombuffer(raw, dtype.dtype).reshape(shape, order="F" if order == "F" else "C")
+    return made
+
+
+def _bytes_of(text: Any, encoding: Any) -> bytes:
+    """Return the bytes that pickles of protocol 2 store as text."""
+    if not isinstance(text, str) or encoding != "latin1":
+        raise pickle.UnpicklingError("it encodes something else than bytes")
+    return text.encode("latin1")
+
+
 _NAMES: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy", "ndarray"): _Array,
     ("numpy", "dtype"): _Dtype,
     ("numpy.core.multiarray", "_reconstruct"): lambda *_: _Array(),
     ("numpy._core.multiarray", "_reconstruct"): lambda *_: _Array(),
+    ("numpy.core.numeric", "_frombuffer"): _from_buffer,
+    ("numpy._core.numeric", "_frombuffer"): _from_buffer,
+    ("_codecs", "encode"): _bytes_of,
     ("collections", "OrderedDict"): lambda *_: _Table(),
     ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,

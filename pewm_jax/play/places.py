@@ -14,7 +14,7 @@ import numpy as np
 from pewm_jax.config import UserError, World
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.importer import ImportConfig, import_recording
-from pewm_jax.data.loader import require_same_cells
+from pewm_jax.data.loader import require_recorded, require_same_cells
 from pewm_jax.data.navigation import NavGrid, is_free, sample_free
 from pewm_jax.data.recordings import read_recording
 from pewm_jax.data.render import render
@@ -77,6 +77,8 @@ def require_shown(model: World, start: Start) -> None:
     Raises:
         UserError: the world was trained on images of blocks, but the drive starts with surfaces.
     """
+    if start.episode:
+        require_recorded(model, EpisodeSource(Path(start.episode)))
     memory: Any = getattr(model, "memory", None)
     if not getattr(memory, "CLASSES", False):
         return

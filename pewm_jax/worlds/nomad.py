@@ -94,8 +94,8 @@ class NomadTask(Task):
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """The clip's frames."""
-        return BatchSpec(context=False)
+        """The clip's frames and their poses."""
+        return BatchSpec(context=False, depth=False)
 
     @property
     def farthest(self) -> int:

@@ -158,3 +158,18 @@ def test_progress_off_the_terminal_is_a_line_now_and_then(capsys, monkeypatch):
         meter.advance(1)
     assert capsys.readouterr().out == "work: 22/100 frames, 2/s, 39 s left\n"
     assert meter.summary() == "work: 23 frames in 20.0 s (1/s)"
+
+
+def test_the_format_is_the_first_argument_or_a_flag(monkeypatch, capsys):
+    ran = []
+    monkeypatch.setattr("pewm_jax.data.importer.import_recording", ran.append)
+    for words in (["tum", "src", "out"], ["--format", "tum", "src", "out"]):
+        assert program.main(["data", "import", *words]) == 0
+    assert [(one.format, str(one.src), str(one.out)) for one in ran] == [("tum", "src", "out")] * 2
+    assert capsys.readouterr().err == ""
+    focal = ["--intrinsics", "1", "1", "1", "1"]
+    assert program.main(["data", "import", "src", "out", *focal]) == 0
+    assert "`pewm-jax data import SRC OUT` is deprecated" in capsys.readouterr().err
+    assert (ran[-1].format, str(ran[-1].src)) == ("open3d", "src")
+    assert "did you mean lerobot?" in refused(capsys, "import", "lerobt", "src", "out")
+    assert "OUT is missing" in refused(capsys, "import", "lerobot", "src")

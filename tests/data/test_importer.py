@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.import_frames import _metres, _to_store
 from pewm_jax.data.importer import (
     ImportConfig,
-    _read_images,
     import_recording,
     planar_actions,
     world_from_recording,
 )
-from pewm_jax.data.recordings import RecordedFrame, natural_key, read_recording
+from pewm_jax.data.recordings import natural_key, read_recording
 from pewm_jax.geometry.cameras import unproject
 from tests.data.two_rooms import HIGH, LOW, arrays, split
 
@@ -104,7 +104,7 @@ def test_resizing_keeps_the_geometry_and_never_blends_depth(tmp_path, walk):
     import_recording(small, lambda _: None)
     episode = imported(tmp_path / "out")
     assert (episode.length, episode.height, episode.width) == (12, 16, 24)
-    np.testing.assert_allclose(episode.intrinsics_4, [12, 8, 12, 8])
+    np.testing.assert_allclose(episode.intrinsics_4, [12, 12, 12, 8])  # 48 × 32 of 48 × 48
     frames = episode.frames()
     recorded = np.rint(walk.depth_THW[::2] * 1000) / 1000
     for k in range(12):
@@ -128,24 +128,14 @@ def test_other_depth_scales_and_float_images(tmp_path, walk):
 
 
 @pytest.mark.parametrize("scale", [1000.0, 5000.0, 1.0])
-def test_a_saturated_pixel_is_no_measurement_at_any_scale(tmp_path, scale):
-    far = tmp_path / "rec" / "00000.png"
-    far.parent.mkdir()
+def test_a_saturated_pixel_is_no_measurement_at_any_scale(scale):
     image = np.full((SIZE, SIZE), round(2 * scale), np.uint16)
     image[:9], image[9:12] = 65535, 65534
-    cv2.imwrite(str(far), image)
-    frames = [RecordedFrame(far, far, np.eye(4))]
-    with pytest.MonkeyPatch.context() as patch:  # the colours are of no interest here
-        patch.setattr("pewm_jax.data.importer._read", read_as)
-        _, depth, _ = _read_images(config(far.parent, tmp_path, depth_scale=scale), frames)
-    assert not depth[0, :9].any()
-    np.testing.assert_allclose(depth[0, 9:12], 65534 / scale)
-    np.testing.assert_allclose(depth[0, 12:], 2)
-
-
-def read_as(path, flags):
-    grey = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    return grey if flags == cv2.IMREAD_UNCHANGED else np.zeros((*grey.shape, 3), np.uint8)
+    stored, per_metre = _to_store(image, scale, 65534 / scale)
+    for depth in (_metres(image, scale), stored / per_metre):
+        assert not depth[:9].any()
+        np.testing.assert_allclose(depth[9:12], 65534 / scale)
+        np.testing.assert_allclose(depth[12:], 2)
 
 
 @pytest.mark.parametrize("scale", [1000.0, 5000.0])
@@ -160,7 +150,7 @@ def test_saturated_and_far_depths_arrive_as_no_measurement(tmp_path, walk, scale
     seen = imported(tmp_path / "a").frames().depth_THW
     assert not seen[:, :6].any()
     np.testing.assert_allclose(seen[:, 6:], walk.depth_THW[:, 6:], atol=6e-4)
-    import_recording(config(folder, tmp_path / "b", max_depth=3.0005, **options), lambda _: None)
+    import_recording(config(folder, tmp_path / "b", max_depth=3.00005, **options), lambda _: None)
     near = imported(tmp_path / "b").frames().depth_THW
     np.testing.assert_array_equal(near, np.where(seen > 3.0, 0, seen))
     assert ((seen > 3.0).any(), near.max() <= 3.0) == (True, True)
@@ -253,17 +243,26 @@ def test_a_frame_in_another_unit_is_named_by_its_file(tmp_path, walk):
         import_recording(config(folder, tmp_path / "out", stride=5), lambda _: None)
 
 
-def test_reading_takes_little_more_memory_than_what_is_read(tmp_path, walk):
+def test_an_import_holds_no_more_than_its_encoded_images(tmp_path, walk):
     folder = record(tmp_path / "rec", walk)
-    frames = read_recording(folder)
+    for name in ("image", "depth"):  # many frames of one picture
+        code = (folder / name / "00000.png").read_bytes()
+        for k in range(400):
+            (folder / name / f"{k:05d}.png").write_bytes(code)
+    pose = "\n".join(" ".join(f"{x:.8f}" for x in row) for row in walk.world_from_camera[0])
+    (folder / "trajectory.log").write_text("".join(f"0 0 0\n{pose}\n" for _ in range(400)))
+    big = config(folder, tmp_path / "out", up="z", size=(256, 256))
+    import_recording(config(folder, tmp_path / "first", up="z", stride=100), lambda _: None)
     tracemalloc.start()
     try:
-        _, depth, _ = _read_images(config(folder, tmp_path / "out"), frames)
+        import_recording(big, lambda _: None)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    assert depth.dtype == np.float32
-    assert peak < 12 * depth.size  # 4 bytes of depth and 3 of colour, and one image at a time
+    (file,) = (tmp_path / "out" / "train").glob("*.array_record")
+    assert imported(tmp_path / "out").length == 400
+    checked = 400 * 128 * 128 * 4  # every second depth, in metres
+    assert peak < 3 * file.stat().st_size + 3 * checked
 
 
 def test_a_hand_held_camera_has_poses_and_no_actions(walk):

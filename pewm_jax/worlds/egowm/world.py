@@ -93,8 +93,10 @@ class EgoWM(AssembledModel):
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """The clip's frames and actions."""
-        return dataclasses.replace(super().batch_spec, context=False, features=None)
+        """The clip's frames and actions; poses only where no actions steer."""
+        poses = not self.control.actions
+        spec = super().batch_spec
+        return dataclasses.replace(spec, context=False, features=None, poses=poses)
 
     @property
     def capabilities(self) -> Capabilities:

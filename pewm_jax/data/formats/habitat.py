@@ -1,0 +1,141 @@
+"""Habitat: meshes (HM3D's GLB files) and episodes (``.json.gz``); images are rendered.
+
+An episode has ``scene_id``, ``start_position`` (y up), ``start_rotation`` (quaternion xyzw, forward
+is −z) and perhaps ``reference_path`` or ``goals``. The agent starts there and walks by turns and
+steps along the reference path, or else along the shortest path to the first goal. y is turned to z.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import gzip
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from pewm_jax.config import UserError
+from pewm_jax.data import navigation
+from pewm_jax.data.episodes import SATURATED
+from pewm_jax.data.formats.habitat_walk import walk
+from pewm_jax.data.formats.options import ImportConfig
+from pewm_jax.data.formats.reader import Entry, Format, Load, Picture, RawSequence
+from pewm_jax.data.render import render
+from pewm_jax.data.scenes import Scene, load_scene
+from pewm_jax.geometry.cameras import intrinsics_from_fov
+from pewm_jax.registry import register
+from pewm_jax.types import Camera
+
+SIZE = (256, 256)
+"""Width and height of images without ``--size``."""
+RADIUS_M = 0.2
+"""Radius of the agent where a shortest path is searched."""
+
+
+@register("format", "habitat")
+@dataclasses.dataclass(frozen=True)
+class Habitat(Format):
+    """Meshes and episodes of Habitat, such as HM3D's."""
+
+    NAME: ClassVar[str] = "habitat"
+    LAYOUT: ClassVar[str] = "*.glb and episodes in *.json.gz"
+    DEPTH_SCALE: ClassVar[float | None] = None
+    USES: ClassVar[tuple[str, ...]] = (
+        *("episodes", "fov", "camera_height"),
+        *("frames", "step", "turn_deg"),
+    )
+
+    def recognise(self, src: Path) -> str:
+        """Return the names of a mesh and of a file of episodes."""
+        mesh = next(src.rglob("*.glb"), None)
+        listed = next(src.rglob("*.json.gz"), None)
+        return f"{mesh.name} and {listed.name}" if mesh and listed else ""
+
+    def entries(self, options: ImportConfig) -> list[Entry]:
+        """Return a sequence for each episode, of ``--frames`` frames or fewer."""
+        src, where = options.src, options.episodes or options.src
+        if not src.is_dir():
+            raise UserError(f"{src} is not a folder; give the folder of the meshes.")
+        meshes = sorted(src.rglob("*.glb"), key=lambda path: (".basis." in path.name, path))
+        files = [where] if where.is_file() else sorted(where.rglob("*.json.gz"))
+        episodes = [one for path in files for one in _episodes(path)]
+        if not episodes:
+            raise UserError(
+                f"{where} has no episodes; give a .json.gz file of Habitat with --episodes."
+            )
+        world = _World(options)
+        found = []
+        for k, episode in enumerate(episodes):
+            mesh = _mesh_of(str(episode.get("scene_id", "")), meshes, src)
+            what = f"episode {episode.get('episode_id', k)} of {mesh.name}"
+            path = walk(episode, options, functools.partial(_grid, mesh), what)
+            name = f"{_stem(mesh)}/{episode.get('episode_id', k)}"
+            found.append(Entry(name, len(path), functools.partial(world.open, mesh, path)))
+        return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _World:
+    options: ImportConfig
+
+    def open(self, mesh: Path, pose_T44: np.ndarray) -> RawSequence:
+        """Return the frames along poses, which are rendered when they are read."""
+        size = self.options.size or SIZE
+        intrinsics = intrinsics_from_fov(size[1], size[0], self.options.fov)
+        scene = _scene(mesh)
+        # A unit that no depth in the scene exceeds.
+        across = float(np.linalg.norm(np.ptp(scene.vertices_V3, axis=0)))
+        scale = float(np.floor(min(10000.0, (SATURATED - 1) / across)))
+
+        def load(k: int) -> Picture:
+            seen = render(scene, Camera(intrinsics, pose_T44[k : k + 1]), size[1], size[0])
+            depth = np.rint(seen.depth_THW[0] * scale).clip(0, SATURATED - 1).astype(np.uint16)
+            return Picture(np.ascontiguousarray(seen.rgb_THWC[0, ..., ::-1]), depth)
+
+        def read(chosen: Sequence[int]) -> Iterator[Load]:
+            return (functools.partial(load, k) for k in chosen)
+
+        info = {"step_m": self.options.step, "turn_deg": self.options.turn_deg}
+        label = f"{mesh}, frame"
+        return RawSequence(
+            pose_T44, intrinsics, size, read, lambda k: f"{label} {k}", scale, info=info
+        )
+
+
+@functools.lru_cache(maxsize=1)
+def _scene(mesh: Path) -> Scene:
+    return load_scene(mesh, "y")
+
+
+@functools.lru_cache(maxsize=4)
+def _grid(mesh: Path) -> navigation.NavGrid:
+    return navigation.navigable(_scene(mesh), agent_radius_m=RADIUS_M)
+
+
+def _episodes(path: Path) -> list[dict[str, Any]]:
+    """Read one file of episodes; a file that only refers to others has none."""
+    try:
+        with gzip.open(path, "rt", encoding="utf-8") as file:
+            found = json.load(file)["episodes"]
+    except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} cannot be read as episodes of Habitat ({error!r}).") from None
+    return [one for one in found if isinstance(one, dict)]
+
+
+def _stem(mesh: Path) -> str:
+    return mesh.name.split(".")[0]
+
+
+def _mesh_of(scene_id: str, meshes: list[Path], src: Path) -> Path:
+    """Return the mesh that an episode names, rather one without compressed textures."""
+    wanted = Path(scene_id).name.split(".")[0]
+    found = [path for path in meshes if _stem(path) == wanted]
+    if not found:
+        raise UserError(
+            f"{src} has no mesh {wanted}.glb or {wanted}.basis.glb, which an episode names: put it "
+            "below this folder."
+        )
+    return found[0]
