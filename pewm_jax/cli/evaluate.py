@@ -72,7 +72,7 @@ def evaluate(settings: EvaluateSettings) -> None:
             raise ConfigError(
                 f"{run} contains a codec, which one process evaluates: omit --distributed."
             )
-        runtime.cache_compilation(Path(run).parent)
+        runtime.cache_compilation(shipped.home(run).parent)
         _score_codec(settings)
         return
     # Imported lazily: help and errors are fast, and Ctrl-C is clean meanwhile.

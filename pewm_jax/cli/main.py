@@ -151,6 +151,17 @@ COMMANDS = {
         f"{CONVERT}.options:ExportStableHLO",
         f"{CONVERT}.commands:export_stablehlo",
     ),
+    "pull": Command(
+        "download a world model by its name on a hub",
+        f"{CLI}.hub:PullSettings",
+        f"{CLI}.hub:pull",
+        resumes=True,
+    ),
+    "push": Command(
+        "upload a world model under a name on a hub",
+        f"{CLI}.hub:PushSettings",
+        f"{CLI}.hub:push",
+    ),
     "plan": Command(
         "predict memory and time of a training on other hardware",
         f"{CLI}.train:arguments",
