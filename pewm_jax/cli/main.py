@@ -70,6 +70,16 @@ COMMANDS = {
         "pewm_jax.data.show:ShowConfig",
         "pewm_jax.data.show:show",
     ),
+    "data export": Command(
+        "write episodes for LeRobot, RLDS or Rerun, as points or as videos",
+        "pewm_jax.data.exports.options:ExportConfig",
+        "pewm_jax.data.exports.options:export",
+    ),
+    "show": Command(
+        "imagine along an episode, and write it for Rerun, as points or a video",
+        f"{CLI}.show:Settings",
+        f"{CLI}.show:run",
+    ),
     "train": Command(
         "train a world model, or resume an interrupted training",
         f"{CLI}.train:arguments",
@@ -152,6 +162,17 @@ COMMANDS = {
         f"{CONVERT}.options:ExportStableHLO",
         f"{CONVERT}.commands:export_stablehlo",
     ),
+    "pull": Command(
+        "download a world model by its name on a hub",
+        f"{CLI}.hub:PullSettings",
+        f"{CLI}.hub:pull",
+        resumes=True,
+    ),
+    "push": Command(
+        "upload a world model under a name on a hub",
+        f"{CLI}.hub:PushSettings",
+        f"{CLI}.hub:push",
+    ),
     "plan": Command(
         "predict memory and time of a training on other hardware",
         f"{CLI}.train:arguments",
@@ -159,7 +180,7 @@ COMMANDS = {
     ),
 }
 GROUPS = {
-    "data": "collect, import, validate and show episodes",
+    "data": "collect, import, validate, show and export episodes",
     "memory": "compute the image encoder's features of a data set once",
     "convert": "import CogVideoX, SVD, Cosmos or DINOv2, export trained weights",
     "convert import": "read a checkpoint of another library",

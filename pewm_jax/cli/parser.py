@@ -29,7 +29,12 @@ import tyro
 from pewm_jax import registry
 from pewm_jax.cli.plugins import Plugins, take
 from pewm_jax.config import Config, Settings
-from pewm_jax.config.migrations import RENAMED_FLAGS, RENAMED_SETTINGS, kind_now
+from pewm_jax.config.migrations import (
+    RENAMED_FLAGS,
+    RENAMED_SETTINGS,
+    kind_now,
+    logs_with,
+)
 from pewm_jax.config.overlay import overlay, section_with_kinds, with_kind
 from pewm_jax.errors import ConfigError, UserError, report
 
@@ -134,6 +139,7 @@ def read(wanted: Arguments, argv: Sequence[str], prog: str) -> dict[str, Any]:
             files, flags = take(flags, lambda flag: flag == "--config")
             if any(file is None for _, file in files):
                 raise ConfigError("--config needs the name of a JSON file of settings.")
+            flags = _joined(_present_logs(flags), "--log")
             under = overlay(default, Path(str(files[0][1]))) if files else default
             config, flags = take_kinds(full_names(flags, under), under)
             groups[name] = kind, config
@@ -200,6 +206,20 @@ def _renamed(model: Any) -> dict[str, str]:
     fields = {field.name for field in dataclasses.fields(model)}
     tables = RENAMED_SETTINGS.values()
     return {old: new for table in tables for old, new in table.items() if new in fields}
+
+
+def _present_logs(flags: Sequence[str]) -> list[str]:
+    """Return flags with ``--log`` for its full name and for ``--train.wandb PROJECT``."""
+    projects, rest = take(flags, lambda flag: flag == "--train.wandb")
+    rest = [re.sub(r"^--train\.log(?==|$)", "--log", flag) for flag in rest]
+    if not projects or not projects[-1][1]:
+        return rest
+    logs = logs_with(projects[-1][1])
+    print(
+        f"warning: --train.wandb PROJECT is deprecated; use --log {' '.join(logs)}.",
+        file=sys.stderr,
+    )
+    return [*rest, "--log", *logs]
 
 
 def take_kinds(flags: Sequence[str], default: T) -> tuple[T, list[str]]:

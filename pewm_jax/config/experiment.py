@@ -10,7 +10,7 @@ from pewm_jax.config.world import World, require_capabilities
 from pewm_jax.errors import require
 from pewm_jax.registry import part, require_section
 
-VERSION = 4
+VERSION = 5
 """The version of ``config.json`` that is written; ``migrations`` upgrades earlier ones."""
 
 

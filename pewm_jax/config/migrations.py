@@ -105,6 +105,20 @@ def from_3(values: Values, where: str, under: Kinds) -> Values:
     return values
 
 
+def from_4(values: Values, where: str, under: Kinds) -> Values:
+    """Turn the project of Weights & Biases, ``train.wandb``, into one of ``train.log``."""
+    del where, under
+    train = values.get("train")
+    if isinstance(train, dict) and (project := train.pop("wandb", "")):
+        train["log"] = logs_with(project)
+    return values
+
+
+def logs_with(project: str) -> list[str]:
+    """Return the logs that ``train.wandb`` set to a project meant up to version 4."""
+    return ["jsonl", "tensorboard", f"wandb:{project}"]
+
+
 def _rename_settings(values: Values) -> None:
     """Rename settings that had other names in earlier files of the current version, in place."""
     model = values.get("model")
@@ -169,7 +183,12 @@ def _move(old: Values, name: str, new: Values, to: str) -> None:
         new[to] = old.pop(name)
 
 
-MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {1: from_1, 2: from_2, 3: from_3}
+MIGRATIONS: dict[int, Callable[[Values, str, Kinds], Values]] = {
+    1: from_1,
+    2: from_2,
+    3: from_3,
+    4: from_4,
+}
 """Version → the function that upgrades its values to the next version."""
 
 RENAMED_KINDS = {("reader", "attention"): "attend"}
@@ -190,6 +209,7 @@ RENAMED_FLAGS = (
     ("diffusion.", "model.noise."),
     ("codec.vae.", "model.codec."),
     ("train.dtype", "model.dtype"),
+    ("log", "train.log"),
     ("memory.depth", "model.clip.depth"),
     ("memory.no_depth", "model.clip.no_depth"),
     ("memory.encoder", "model.memory.encoder.kind"),

@@ -11,6 +11,9 @@ from pewm_jax.errors import ConfigError, is_pattern, require, require_fields, re
 AXES = ("data", "fsdp", "tensor", "context")
 """The mesh axes, outermost first; devices along the last ones communicate most."""
 
+LOGS = ("jsonl", "tensorboard", "wandb", "rerun")
+"""Where scalars can be logged."""
+
 
 SHARES = ("hidden", "memory_errors", "chained")
 """Settings of training that are shares of clips."""
@@ -168,9 +171,11 @@ class TrainSettings:
     """Steps between log lines."""
     preview_every: int = 250
     """Steps between sample images; 0 for none."""
-    wandb: str = ""
-    """Project of Weights & Biases that gets what TensorBoard gets (`pip install 'pewm-jax[wandb]'`;
-    WANDB_MODE=offline keeps it in the run's folder); empty: none."""
+    log: tuple[str, ...] = ("jsonl", "tensorboard")
+    """Where scalars are logged, in short --log; one or several of: `jsonl` (metrics.jsonl),
+    `tensorboard`, `rerun` (`pip install 'pewm-jax[rerun]'`), `wandb` or `wandb:PROJECT` (`pip
+    install 'pewm-jax[wandb]'`; WANDB_MODE=offline keeps it in the run's folder); `none` alone: no
+    log is written. All are in the run's folder, and no others are written."""
     mesh: MeshConfig = MeshConfig()
     """How devices are arranged; may differ each time a run is resumed."""
     fresh: tuple[str, ...] = (r"memory/.*",)
@@ -218,8 +223,26 @@ class TrainSettings:
         for name, reason in self.ZERO.items():
             value = getattr(self, name)
             require(value == 0, f"train.{name} is {value}: {reason}, use 0.")
+        self._require_known_logs()
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")
+
+    def _require_known_logs(self) -> None:
+        """Refuse an unknown log, one that is named twice, and `none` beside others."""
+        known = [name.partition(":")[0] if name != "wandb:" else name for name in self.log]
+        wrong = [name for name in known if name not in LOGS]
+        wrong += [name for name in self.log if ":" in name and not name.startswith("wandb:")]
+        hint = f"use one or several of {', '.join(LOGS)}, or none"
+        if known != ["none"]:
+            require(not wrong, f"train.log is {' '.join(self.log)}: {hint}.")
+            require(bool(known), f"train.log is empty: {hint}.")
+        require(len(set(known)) == len(known), f"train.log names {' '.join(self.log)}: {hint}.")
+
+    @property
+    def logs(self) -> dict[str, str]:
+        """Return the logs to write, and what follows a colon after their names."""
+        parts = [name.partition(":") for name in self.log if name != "none"]
+        return {name: argument for name, _, argument in parts}
 
     def require_fit(self, model: Any) -> None:
         """Refuse settings that do not go together with the world's."""

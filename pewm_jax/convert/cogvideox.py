@@ -33,7 +33,7 @@ from pewm_jax.config import ClipConfig, Config, Encoder, UserError
 from pewm_jax.convert import pipeline, schedulers, widen
 from pewm_jax.convert.pipeline import CONFIG, WEIGHTS
 from pewm_jax.diffusion.ddpm import DDPMConfig
-from pewm_jax.io import sources, tensor_files, tree, weights
+from pewm_jax.io import hub, sources, tensor_files, tree, weights
 from pewm_jax.io.published import Network
 from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
@@ -105,19 +105,20 @@ def load_scheduler(folder: str | Path) -> DDPMConfig:
     return configuration.load(Path(folder) / "scheduler" / CONFIG, DDPMConfig)
 
 
-def write_network(config: Any, params: Params, folder: Path) -> None:
-    """Write one network in our layout."""
+def write_network(network: Network, src: Path, dtype: str | None, folder: Path) -> None:
+    """Write one published network in our layout, tensor by tensor as it is read."""
     folder.mkdir(parents=True)
-    configuration.save(config, folder / CONFIG)
-    size = tensor_files.size(tree.flatten(params))
-    with pipeline.megabytes(f"write {folder.name}", size) as progress:
-        weights.save(folder / WEIGHTS, params, progress=progress)
+    configuration.save(pipeline.read_config(network, src), folder / CONFIG)
+    specs, blocks = pipeline.part(network, src, dtype)
+    with pipeline.megabytes(f"write {folder.name}", tensor_files.size(specs)) as progress:
+        header = tensor_files.header({})
+        tensor_files.write(folder / WEIGHTS, specs, blocks(), header, progress)
 
 
 def import_pipeline(
     src: Path, dst: Path, dtype: str | None, prompts: dict[str, np.ndarray], record: dict[str, Any]
 ) -> None:
-    """Write an imported folder, one network at a time.
+    """Write an imported folder, one tensor at a time.
 
     Args:
         dtype: dtype of the weights; by default the stored one.
@@ -126,7 +127,7 @@ def import_pipeline(
     """
     with pipeline.new_folder(dst) as folder:
         for network in (TRANSFORMER, VAE):
-            write_network(*pipeline.read(network, src, dtype), folder / network.folder)
+            write_network(network, src, dtype, folder / network.folder)
         (folder / "scheduler").mkdir()
         configuration.save(read_scheduler(src), folder / "scheduler" / CONFIG)
         if prompts:
@@ -151,7 +152,7 @@ def describe_base(
     return {
         **{part: settings[part] for part in PARTS},
         "model_index": sources.read_json(index) if index.is_file() else None,
-        "name": src.resolve().name,
+        "name": hub.title(src),
         "licence": licence(src),
         "prompts": list(prompts),
         "dtype": dtype or "as stored",
@@ -268,7 +269,7 @@ def import_world(
 ) -> None:
     """Write a world model's folder: ``config.json``, ``weights.safetensors``, ``base.json``.
 
-    It is written part by part, so at most one network is in memory at a time.
+    It is written while it is read, so one tensor is in memory at a time.
 
     Args:
         config: the world model, from ``config_of``.
@@ -282,8 +283,16 @@ def import_world(
     channels = config.model.control.channels(config.model)
     plan = widen.plan(old, config.model.codec.latent_channels, channels)
 
-    def backbone() -> Params:
-        return widen.widen(plan, read_transformer(src, dtype)[1])
+    def is_end(path: str) -> bool:
+        return path.startswith(widen.ENDS)
+
+    def backbone() -> pipeline.Blocks:
+        ends: dict[str, list[np.ndarray]] = {}
+        for path, block in pipeline.stream(TRANSFORMER, src, dtype, is_end):
+            ends.setdefault(path, []).append(block)
+        narrow = {path: np.concatenate(blocks) for path, blocks in ends.items()}
+        yield from tree.flatten(widen.widen(plan, tree.unflatten(narrow))).items()
+        yield from pipeline.stream(TRANSFORMER, src, dtype, lambda path: not is_end(path))
 
     def blocks() -> Params:
         return jax.jit(lambda k: config.model.memory.reader.init(config.model, k))(
@@ -295,7 +304,7 @@ def import_world(
     specs = {p: jax.ShapeDtypeStruct(wide[p].shape, spec.dtype) for p, spec in stored.items()}
     parts: dict[str, pipeline.Part] = {"backbone": (specs, backbone)}
     if memory:
-        parts["memory"] = (pipeline.cast_specs(jax.eval_shape(blocks), dtype), blocks)
+        parts["memory"] = pipeline.made(jax.eval_shape(blocks), blocks, dtype)
     parts["codec"] = pipeline.part(VAE, src, dtype)
     given: dict[str, Params] = {}
     if encoder is not None:
@@ -303,7 +312,7 @@ def import_world(
     if prompt_LC is not None:
         given["text"] = {"prompt_LC": prompt_LC}
     for name, params in given.items():
-        parts[name] = (pipeline.cast_specs(params, dtype), functools.partial(dict, params))
+        parts[name] = pipeline.made(params, functools.partial(dict, params), dtype)
     pipeline.write_world(dst, config, parts, {BASE: record})
 
 

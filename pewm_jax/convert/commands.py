@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from collections.abc import Sequence
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -30,6 +31,7 @@ from pewm_jax.convert.options import (
     ImportSVD,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
+from pewm_jax.io import hub
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.config import Learned
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
@@ -38,11 +40,54 @@ from pewm_jax.models.dinov2 import model as dinov2_model
 from pewm_jax.models.dinov2.model import DINOv2EncoderConfig
 from pewm_jax.types import Params
 
+Options = TypeVar("Options", ImportCogVideoX, ImportCosmos2, ImportDINOv2, ImportSVD)
+
+
+FOLDERS = {
+    ImportCogVideoX: ("transformer", "vae", "scheduler", "text_encoder", "tokenizer"),
+    ImportCosmos2: ("transformer", "vae", "scheduler", "text_encoder", "tokenizer"),
+    ImportSVD: ("unet", "vae", "image_encoder", "scheduler"),
+    ImportDINOv2: (".",),
+}
+"""The folders of a pipeline that each command reads."""
+SETTINGS = ("*config.json", "tokenizer*", "spiece.model", "*map.json")
+PLAIN = ("diffusion_pytorch_model", "model")
+"""Names of weights without a precision (``*.fp16.safetensors``), which are preferred."""
+
+
+def _patterns(folders: Sequence[str], *, plain: bool) -> list[str]:
+    """Return the patterns of the files of a pipeline; ``plain``: without those of a precision."""
+    tensors = ["*.safetensors", "*.safetensors.index*.json"]
+    if plain:
+        ends = (".safetensors", "-*.safetensors", ".safetensors.index.json")
+        tensors = [name + end for name in PLAIN for end in ends]
+    files = (*SETTINGS, *tensors)
+    inside = [file if name == "." else f"{name}/{file}" for name in folders for file in files]
+    return [*inside, "model_index.json", "README.md", "LICENSE*"]
+
+
+def _found(options: Options) -> Options:
+    """Return options with the folder of a source that is given by its name on a hub.
+
+    Raises:
+        UserError: ``dst`` exists, or the source cannot be had from the hub.
+    """
+    pipeline.refuse_existing(options.dst)
+    if options.src.exists():
+        return options
+    folders = FOLDERS[type(options)]
+    folder = hub.find(options.src, _patterns(folders, plain=True))
+    if folder is None:
+        return options
+    if not any((folder / folders[0]).glob("*.safetensors")):
+        hub.find(options.src, _patterns(folders, plain=False))
+    return dataclasses.replace(options, src=folder)
+
 
 def import_cogvideox(options: ImportCogVideoX) -> None:
     """Run ``import cogvideox``."""
+    options = _found(options)
     src, dst = options.src, options.dst
-    pipeline.refuse_existing(dst)
     cogvideox.require_pipeline(src)
     settings = {part.folder: pipeline.published_config(part, src) for part in (TRANSFORMER, VAE)}
     settings["scheduler"] = schedulers.published_config(schedulers.COGVIDEOX, src)
@@ -143,11 +188,13 @@ def _summary(options: ImportCogVideoX, prompts: dict[str, np.ndarray]) -> str:
 
 def import_dinov2(options: ImportDINOv2) -> None:
     """Run ``import dinov2``."""
+    options = _found(options)
     dinov2.convert(options.src, options.dst, options.dtype)
 
 
 def import_svd(options: ImportSVD) -> None:
     """Run ``import svd``."""
+    options = _found(options)
     size = options.height, options.width
     svd.import_world(options.src, options.dst, options.dtype, size)
     print(
@@ -157,6 +204,7 @@ def import_svd(options: ImportSVD) -> None:
 
 def import_cosmos2(options: ImportCosmos2) -> None:
     """Run ``import cosmos2``."""
+    options = _found(options)
     size = options.frames, options.height, options.width
     texts = options.prompt, options.negative
     encoded = cosmos.import_world(options.src, options.dst, options.dtype, size, texts)

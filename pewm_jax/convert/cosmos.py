@@ -106,6 +106,6 @@ def import_world(
         tokens: Params = dict(
             zip(("prompt_LC", "negative_LC"), (encoded[prompt] for prompt in prompts), strict=True)
         )
-        parts["text"] = (pipeline.cast_specs(tokens, dtype), lambda: tokens)
+        parts["text"] = pipeline.made(tokens, lambda: tokens, dtype)
     pipeline.write_world(dst, config, parts)
     return bool(encoded)

@@ -45,12 +45,18 @@ TRAINED_ON = "train"
 
 
 def export(
-    run: Path, dst: Path, dtype: str = "bfloat16", *, log: Callable[[str], Any] = print
+    run: Path,
+    dst: Path,
+    dtype: str | None = "bfloat16",
+    *,
+    name: str = "",
+    log: Callable[[str], Any] = print,
 ) -> Path:
     """Write the inference weights and settings of a training run into a new folder, ``dst``.
 
     The run is a folder made by ``train.py`` (or a converted checkpoint in the same form). Its
-    weights file already contains the EMA of trained weights and the frozen weights.
+    weights file already contains the EMA of trained weights and the frozen weights. ``dtype`` None
+    stores them unchanged. ``name`` is the model's on the card, by default that of the folder.
 
     Raises:
         UserError: ``dst`` exists; or the run is missing, damaged, a policy, or has no weights yet.
@@ -68,7 +74,8 @@ def export(
         origin = _base(run, config)
         metadata = weights.metadata(run / runs.WEIGHTS)
         facts = CardFacts(
-            name=dst.name,
+            name=name or dst.name,
+            dtype=dtype,
             version=__version__,
             config=config,
             params=params,
@@ -77,8 +84,11 @@ def export(
             base=sources.read_json(origin) if origin else None,
             metrics=_metrics(run),
         )
-        log(f"writing {_count(params) / 1e6:.1f} million parameters in {dtype} …")
-        _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": dtype}, jnp.dtype(dtype))
+        log(f"writing {_count(params) / 1e6:.1f} million parameters …")
+        if dtype is None:
+            weights.save(folder / runs.WEIGHTS, params, metadata)
+        else:
+            _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": dtype}, jnp.dtype(dtype))
         configuration.save(config, folder / runs.CONFIG)
         if origin:
             shutil.copyfile(origin, folder / runs.BASE)
@@ -147,6 +157,7 @@ class CardFacts:
 
     Attributes:
         name: name of the model, the heading.
+        dtype: precision to which weights are rounded, or None.
         version: of this library.
         config: the run's settings.
         params: its weights.
@@ -157,6 +168,7 @@ class CardFacts:
     """
 
     name: str
+    dtype: str | None
     version: str
     config: Config
     params: Params
@@ -169,7 +181,7 @@ class CardFacts:
 def write_card(facts: CardFacts) -> str:
     """Return the card in Markdown."""
     parts = [f"# {facts.name}", _what(facts), _use(facts), _data(facts), _training(facts)]
-    return "\n\n".join([*parts, _scores(facts.metrics), _licence(facts)]) + "\n"
+    return "\n\n".join([*parts, _scores(facts.metrics, facts.dtype), _licence(facts)]) + "\n"
 
 
 def _count(params: Params) -> int:
@@ -201,7 +213,8 @@ def _what(facts: CardFacts) -> str:
         f"imagines what the agent will see, {seen}, in clips of {size}, with {memory}{made_of}."
         f"\n\n{table}\n\n"
         "Weights are the moving average of the trained parameters and the unchanged base weights "
-        f"elsewhere, rounded to 16 bits; they compute in {config.model.dtype}. Written by "
+        f"elsewhere{', rounded to 16 bits' * bool(facts.dtype)}; they compute in "
+        f"{config.model.dtype}. Written by "
         f"pewm_jax {facts.version}."
     )
 
@@ -277,7 +290,7 @@ def _training(facts: CardFacts) -> str:
     return head + "\n".join(rows) + tail
 
 
-def _scores(metrics: Mapping[str, Any] | None) -> str:
+def _scores(metrics: Mapping[str, Any] | None, dtype: str | None) -> str:
     head = "## Scores\n\n"
     if metrics is None:
         return head + "None: these weights have no report; `python evaluate.py RUN` writes one."
@@ -305,8 +318,8 @@ def _scores(metrics: Mapping[str, Any] | None) -> str:
             rows.append(f"| {where} | {label} | " + " | ".join(cells) + " |")
     new = {True: "none of which", False: "some of which", None: "of which it is not known which"}
     said = (
-        f"\n\nMeasured before rounding: {protocol['clips']} clips in {protocol['scenes']} scenes, "
-        f"{new[protocol['held_out']]} it was trained in, seeds "
+        f"\n\nMeasured{' before rounding' * bool(dtype)}: {protocol['clips']} clips in "
+        f"{protocol['scenes']} scenes, {new[protocol['held_out']]} it was trained in, seeds "
         f"{', '.join(map(str, protocol['seeds']))}, {protocol['sampling_steps']} sampling steps, "
         f"protocol {protocol['fingerprint'][:12]}."
     )

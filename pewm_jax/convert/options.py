@@ -31,8 +31,8 @@ class ImportCogVideoX:
     """Flags with several values that may also be given several times."""
 
     src: Annotated[Path, tyro.conf.Positional]
-    """The pipeline's folder: transformer/, vae/, scheduler/ and, if prompts are to be encoded,
-    text_encoder/ and tokenizer/."""
+    """The pipeline's folder, or its name on a hub (org/name or org/name@revision): transformer/,
+    vae/, scheduler/ and, if prompts are to be encoded, text_encoder/ and tokenizer/."""
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to create."""
     dtype: Dtype | None = None
@@ -91,8 +91,8 @@ class ImportDINOv2:
     """Import DINOv2, the encoder of the map's image features."""
 
     src: Annotated[Path, tyro.conf.Positional]
-    """A folder of transformers (config.json, model.safetensors), or the original repository's
-    state dict (.pth or .safetensors)."""
+    """A folder of transformers (config.json, model.safetensors), its name on a hub, or the original
+    repository's state dict (.pth or .safetensors)."""
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to create."""
     dtype: Dtype | None = None
@@ -108,7 +108,7 @@ class ImportSVD:
     """
 
     src: Annotated[Path, tyro.conf.Positional]
-    """The pipeline's folder: unet/, vae/, image_encoder/ and scheduler/."""
+    """The pipeline's folder, or its name on a hub: unet/, vae/, image_encoder/ and scheduler/."""
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to create."""
     dtype: Dtype | None = None
@@ -129,8 +129,8 @@ class ImportCosmos2:
     """
 
     src: Annotated[Path, tyro.conf.Positional]
-    """The pipeline's folder: transformer/, vae/, scheduler/ and, if a prompt is to be encoded,
-    text_encoder/ and tokenizer/."""
+    """The pipeline's folder, or its name on a hub: transformer/, vae/, scheduler/ and, if a prompt
+    is to be encoded, text_encoder/ and tokenizer/."""
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to create."""
     dtype: Dtype | None = None

@@ -4,8 +4,8 @@ A family's table of names is a ``Network`` in ``models/<family>/convert.py``. ``
 published network to our parameter tree and ``write`` converts it back, tensor by tensor and
 strictly: every tensor must exist, have the right shape and be used. Names and shapes are checked
 from the table and the abstract tree before any weight is read, so errors are found early.
-``write_world`` writes a world model's folder part by part, so that one network is in memory at a
-time. Folders are written atomically (``new_folder``).
+``write_world`` writes a world model's folder tensor by tensor while they are read, so that one
+tensor is in memory at a time. Folders are written atomically (``new_folder``).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +35,13 @@ FLOATS = ("float32", "bfloat16", "float16")
 STORED = (*FLOATS, "float64")
 """Supported dtypes of stored weights; a table computed by a network can be float64."""
 _MEGABYTE = 1 << 20
+_CAST = 16 * _MEGABYTE
+"""Bytes of a tensor that are converted to another dtype at once."""
 Specs = dict[str, jax.ShapeDtypeStruct]
 """Shape and dtype of every leaf, by path."""
-Part = tuple[Specs, Callable[[], Params]]
+Blocks = Iterable[tuple[str, Array]]
+"""Leaves by path, each whole or in consecutive blocks (``tensor_files.write``)."""
+Part = tuple[Specs, Callable[[], Blocks]]
 """The abstract parameters of a part, and the function that reads or creates them."""
 
 _LISTED = 200
@@ -131,8 +135,55 @@ def specs(network: Network, folder: Path, dtype: str | None = None) -> Specs:
 
 
 def part(network: Network, folder: Path, dtype: str | None = None) -> Part:
-    """Return a published network as a part of a world model, read lazily when it is written."""
-    return specs(network, folder, dtype), lambda: read(network, folder, dtype)[1]
+    """Return a published network as a part of a world model, read while it is written."""
+    return specs(network, folder, dtype), lambda: stream(network, folder, dtype)
+
+
+def made(like: Params, make: Callable[[], Params], dtype: str | None = None) -> Part:
+    """Return parameters that are created when they are written as a part; ``like`` are shapes."""
+    return cast_specs(like, dtype), lambda: tree.flatten(make()).items()
+
+
+def stream(
+    network: Network,
+    folder: Path,
+    dtype: str | None = None,
+    wanted: Callable[[str], bool] = lambda _: True,
+) -> Blocks:
+    """Yield the leaves of a published network in blocks, read one published tensor at a time.
+
+    Args:
+        dtype: as for ``read``.
+        wanted: returns, by path, whether to read a leaf.
+
+    Raises:
+        UserError: as ``read``.
+    """
+    config, source, _ = _open(network, folder)
+    entries, like = network.entries(config), network.like(config)
+    require(entries, source, like)
+    announced = leaf_specs(entries, source, like, dtype)
+    for entry in sorted(entries, key=lambda entry: (entry.path, entry.layer or 0)):
+        if wanted(entry.path):
+            where, leaf = f"{source.where}: {entry.name}", announced[entry.path]
+            tensor = entry.transform.read(source.read(entry.name))
+            tensor = tensor if entry.layer is None or leaf.shape[0] > 1 else tensor[None]
+            for block in _cast_blocks(tensor, leaf.dtype, where):
+                yield entry.path, block
+            del tensor  # free memory before the next one is read
+
+
+def _cast_blocks(tensor: np.ndarray, dtype: np.dtype, where: str) -> Iterator[np.ndarray]:
+    """Yield a tensor in another dtype: unchanged if it has it, else in blocks of rows."""
+    if tensor.dtype == dtype:
+        yield tensor
+        return
+    tensor = np.atleast_1d(tensor)
+    rows = max(1, len(tensor) * _CAST // max(tensor.nbytes, 1))
+    for row in range(0, len(tensor), rows):
+        block = np.empty(tensor[row : row + rows].shape, dtype)
+        _cast(tensor[row : row + rows], block, where)
+        yield block
 
 
 def write(
@@ -365,8 +416,9 @@ def write_world(
 
     def tensors() -> Iterator[tuple[str, Array]]:
         for part, (_, make) in parts.items():
-            for path, leaf in tree.flatten({part: make()}).items():
-                yield path, np.asarray(leaf).astype(specs[path].dtype, copy=False)
+            for path, block in make():
+                whole = f"{part}/{path}"
+                yield whole, np.asarray(block).astype(specs[whole].dtype, copy=False)
 
     with new_folder(dst) as folder:
         header = tensor_files.header({"stage": "0"})
@@ -383,7 +435,7 @@ def fresh_actions(config: Config, dtype: str | None) -> Part:
     def make() -> Params:
         return jax.jit(config.model.control.init, static_argnums=0)(config.model, jax.random.key(0))
 
-    return cast_specs(jax.eval_shape(make), dtype), make
+    return made(jax.eval_shape(make), make, dtype)
 
 
 def cast_specs(params: Params, dtype: str | None) -> Specs:

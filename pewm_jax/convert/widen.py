@@ -19,6 +19,9 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.nn import tokens
 from pewm_jax.types import Array, Params
 
+ENDS = ("patch_embed/", "proj_out/")
+"""Beginnings of the paths of the leaves that ``widen`` changes."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Widening:
@@ -60,7 +63,7 @@ def plan(old: DiTBackbone, latents: int, camera: int) -> Widening:
 
 
 def widen(plan: Widening, params: Params) -> Params:
-    """Return the world model's backbone; unchanged leaves are the same arrays."""
+    """Return the world model's backbone; unchanged leaves are the same arrays and may be absent."""
     old, new = plan.old, plan.new
     rows = _rows(new, new.in_channels, old.in_channels, plan.inputs)
     columns = _rows(new, new.out_channels, old.out_channels, plan.outputs)

@@ -175,6 +175,10 @@ class Episode:
         offset, size = self.header["streams"][stream]["spans"][index]
         return memoryview(self.record)[offset : offset + size]
 
+    def encoded(self, stream: str, index: int) -> bytes:
+        """Return the PNG image of a frame in the stream ``rgb``, ``depth`` or ``ids``."""
+        return bytes(self._code(stream, index))
+
     def _image(self, stream: str, index: int) -> np.ndarray:
         image = decode_image(self._code(stream, index), cv2.IMREAD_UNCHANGED)
         shape = (self.height, self.width, 3) if stream == "rgb" else (self.height, self.width)

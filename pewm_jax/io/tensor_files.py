@@ -37,6 +37,8 @@ files."""
 _TENSORS, _HEADER = "sha256", "header_sha256"
 """The keys of checksums: of each tensor, and of the header with zeros in place of this one."""
 _NO_DIGEST = "0" * 64
+_BLOCK = 16 << 20
+"""Bytes of an array in another order of axes that are copied at once when it is written."""
 _DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(jnp.bfloat16)} | {
     f"{letter}{8 * size}": np.dtype(f"{letter.lower()}{size}")
     for letter, sizes in (("U", (1, 2, 4, 8)), ("I", (1, 2, 4, 8)), ("F", (2, 4, 8)))
@@ -83,7 +85,8 @@ def write(
     Args:
         path: the file; its folder is created.
         like: name → anything with the tensor's shape and dtype.
-        tensors: the tensors, in any order, each once.
+        tensors: the tensors, in any order, each once: whole, or in consecutive blocks of their
+            values in C order, so that only a block is in memory.
         metadata: the ``__metadata__`` of the header. Checksums are added if it comes from
             ``header``.
         progress: called after every tensor with the bytes just written.
@@ -107,18 +110,30 @@ def write(
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(path) as partial, partial.open("wb") as file:
         file.write(struct.pack("<Q", len(text)) + text)
-        start, left = file.tell(), set(order)
+        start = file.tell()
+        left = {name: math.prod(shape) for name, (shape, _) in specs.items()}
+        hashes = {name: hashlib.sha256() for name in order} if ours else {}
         for name, tensor in tensors:
             array = np.asarray(jax.device_get(tensor))
-            if name not in left or (array.shape, array.dtype) != specs[name]:
+            shape, dtype = specs.get(name, ((), None))
+            whole = array.size == math.prod(shape)
+            if (
+                array.dtype != dtype
+                or array.size > left.get(name, -1)
+                or (whole and array.shape != shape)
+            ):
                 raise ValueError(f"{name} {array.shape} {array.dtype} differs from ``like``.")
-            left.remove(name)
-            file.seek(start + table[name]["data_offsets"][0])
-            raw = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
-            file.write(raw)
-            digests[name] = hashlib.sha256(raw).hexdigest() if ours else ""
+            file.seek(start + table[name]["data_offsets"][1] - left[name] * array.itemsize)
+            left[name] -= array.size
+            for raw in _contiguous(array):
+                file.write(raw)
+                if ours:
+                    hashes[name].update(raw)
             progress(array.nbytes)
-            del tensor, array, raw  # free memory before the next one is made
+            if not left[name]:
+                del left[name]
+                digests[name] = hashes.pop(name).hexdigest() if ours else ""
+            del tensor, array  # free memory before the next one is made
         if left:
             raise ValueError(f"{tree.listing(left)} are in ``like`` but were not yielded.")
         if ours:
@@ -128,6 +143,15 @@ def write(
             file.write(_text(table))
         file.flush()
         os.fsync(file.fileno())
+
+
+def _contiguous(array: np.ndarray) -> Iterator[memoryview]:
+    """Yield the bytes of an array in C order, without a second copy of a large one."""
+    rows = len(array) if array.ndim else 1
+    step = rows if array.flags.c_contiguous else max(1, rows * _BLOCK // max(array.nbytes, 1))
+    for row in range(0, rows, max(step, 1)):
+        block = array[row : row + step] if array.ndim else array
+        yield np.ascontiguousarray(block).reshape(-1).view(np.uint8).data
 
 
 def _text(table: Mapping[str, object]) -> bytes:

@@ -2,12 +2,14 @@
 
 Each is a folder here, in the format of ``pewm-jax convert export inference``: ``config.json``,
 ``weights.safetensors`` in 16 bits, and ``README.md``, its card. ``pewm_jax.load("codec")`` and
-``train.start codec`` find them.
+``train.start codec`` find them. Names such as ``org/name`` are looked up on a hub (``io.hub``).
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+
+from pewm_jax.io import hub
 
 HERE = Path(__file__).parent
 
@@ -17,19 +19,32 @@ def names() -> list[str]:
     return sorted(path.parent.name for path in HERE.glob("*/weights.safetensors"))
 
 
-def find(path: str | Path) -> Path:
+def find(path: str | Path, revision: str | None = None) -> Path:
     """Return the folder of a path or a name.
 
     Args:
-        path: a folder, returned unchanged if it exists, or a name in ``names()``.
+        path: a folder, returned unchanged if it exists; a name in ``names()``; or the name of a
+            model on a hub, ``org/name`` or ``org/name@revision``.
+        revision: of a model on a hub: a branch, a tag or a commit.
+
+    Raises:
+        UserError: the model cannot be had from the hub; see ``hub.find``.
     """
     folder = Path(path)
-    if not folder.exists() and str(path) in names():
+    if folder.exists():
+        return folder
+    if str(path) in names():
         return HERE / str(path)
-    return folder
+    return hub.find(path, revision=revision) or folder
 
 
 def home(path: str | Path) -> Path:
-    """Return the folder for reports: beside the weights, or ``runs/NAME`` for shipped ones."""
+    """Return the folder for reports: beside the weights, or ``runs/NAME`` for those found by name.
+
+    The folders of shipped weights and of the hub's cache are not written to.
+    """
     folder = find(path)
-    return Path("runs") / folder.name if folder.parent == HERE else folder
+    title = hub.title(folder)
+    if folder.parent == HERE or "@" in title:
+        return Path("runs") / title.partition("@")[0].rpartition("/")[2]
+    return folder

@@ -26,24 +26,28 @@ from pewm_jax.worlds import rollouts
 from pewm_jax.worlds.stages import Stage
 
 
-def load(path: str | Path) -> tuple[Config, Params]:
+def load(path: str | Path, *, revision: str | None = None) -> tuple[Config, Params]:
     """Load a world model: the experiment, and its averaged (EMA) inference weights in NumPy arrays.
 
     Args:
         path: one of: a run folder made by ``train.py``, finished or not (the newest weights are
             loaded; while a stage is being trained, those of its newest complete checkpoint); a
             checkpoint folder, such as ``runs/demo/checkpoints/stage1/200``; a folder of converted
-            weights; the name of weights that ship with the library (``shipped.names()``).
+            weights; the name of weights that ship with the library (``shipped.names()``); the name
+            of a model on a hub, ``org/name`` or ``org/name@revision`` (``io.hub``), which is
+            downloaded to the cache first.
+        revision: of a model on a hub: a branch, a tag or a commit; by default the newest.
 
     Raises:
-        UserError: a file is missing or damaged, or the weights do not fit the configuration.
+        UserError: a file is missing or damaged, the weights do not fit the configuration, or the
+            model cannot be downloaded.
     """
     if not isinstance(path, str | os.PathLike):
         raise UserError(
-            f"load() got a path of type {type(path).__name__}: pass the folder of a run, or the "
-            "name of weights that ship with the library, such as 'small'."
+            f"load() got a path of type {type(path).__name__}: pass the folder of a run, the "
+            "name of weights that ship with the library, such as 'small', or org/name on a hub."
         )
-    folder = shipped.find(path)
+    folder = shipped.find(path, revision)
     if (folder / checkpoint_files.WEIGHTS_ITEM).is_dir():
         return _read(folder)
     newer = _checkpoints(folder)

@@ -1,18 +1,13 @@
-"""Training logs: one JSON line and one TensorBoard event per logged step, and a live view.
+"""Training logs: scalars of logged steps where ``train.log`` says, a live view, and profiles.
 
-If ``train.wandb`` names a project, the same scalars are sent to Weights & Biases. The live view is
-a progress bar on a terminal, and otherwise a line every ten seconds.
+The live view is a progress bar on a terminal, and otherwise a line every ten seconds.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
-import json
-import math
 import sys
 import time
-import uuid
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
@@ -21,91 +16,46 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from pewm_jax import config as configuration
-from pewm_jax.config import Config, UserError
-from pewm_jax.io import atomic
+from pewm_jax.config import Config
 from pewm_jax.train import processes
+from pewm_jax.train.sinks import SINKS, Sink
 from pewm_jax.worlds.stages import Stage
 
-FLUSH_S = 10
-"""Seconds between writes of TensorBoard events; JSON lines are written immediately."""
 LINE_EVERY_S = 10.0
 """Seconds between lines of the live view if the output is not a terminal."""
 
 
 class MetricsLog:
-    """Appends scalars to ``metrics.jsonl`` and to TensorBoard; a context manager.
+    """Logs scalars where ``train.log`` says; a context manager.
 
-    Lines logged after the step from which the run is resumed (``step`` steps of the stage are done)
-    are dropped, so that every step has one line. Only process 0 writes.
+    Steps after ``step``, from which the stage is resumed, are dropped from earlier logs, so that
+    every step is logged once. Only process 0 writes.
 
     Raises:
-        UserError: ``config`` enables Weights & Biases, which cannot start.
+        UserError: a log needs a package that is not installed, or cannot start.
     """
 
-    def __init__(self, run: Path, stage: Stage, step: int, config: Config | None = None):
-        self._stage = stage.number
-        self._writes = processes.is_primary()
-        if not self._writes:
+    def __init__(self, run: Path, stage: Stage, step: int, config: Config):
+        self._sinks: list[Sink] = []
+        if not processes.is_primary():
             return
-        # Imported lazily: it takes a second, and imports torch if that is installed.
-        import tensorboardX  # noqa: PLC0415
-
-        self._wandb = None
-        if config is not None and config.train.wandb:
-            self._wandb = start_wandb(config, run, stage)
-        path = run / "metrics.jsonl"
-        drop_after(path, stage.number, step)
-        self._file = path.open("a")
-        self._events = tensorboardX.SummaryWriter(
-            str(run / "tensorboard" / stage.name),
-            purge_step=step + 1 if step else None,
-            flush_secs=FLUSH_S,
-        )
+        for name, argument in config.train.logs.items():
+            self._sinks.append(SINKS[name](run, stage, step, config, argument))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if not self._writes:
-            return
         # Do not let a full disk mask the error being raised.
-        with contextlib.nullcontext() if error is None else contextlib.suppress(OSError):
-            try:
-                self._file.close()
-            finally:
-                self._events.close()
-                if self._wandb is not None:
-                    self._wandb.finish(exit_code=int(error is not None))
+        unmasked = contextlib.nullcontext() if error is None else contextlib.suppress(OSError)
+        with unmasked, contextlib.ExitStack() as stack:
+            for sink in self._sinks:
+                stack.callback(sink.close, error is not None)
 
     def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Log the scalars of one step; NaN and infinity, which JSON lacks, become null."""
-        if not self._writes:
-            return
-        finite = {name: value for name, value in metrics.items() if math.isfinite(value)}
-        values = {name: finite.get(name) for name in metrics}
-        line = {"stage": self._stage, "step": step, **values, "time": round(time.time(), 3)}
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
-        for name, value in finite.items():
-            self._events.add_scalar(name, value, step)
-        if self._wandb is not None:
-            self._wandb.log(finite, step=step)
-
-
-def drop_after(path: Path, stage: int, step: int) -> None:
-    """Drop the log lines after ``step`` of stage number ``stage``, and a partial last line."""
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text().splitlines():
-        try:
-            entry = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        if (entry["stage"], entry["step"]) <= (stage, step):
-            kept.append(line + "\n")
-    atomic.write_text(path, "".join(kept))
+        """Log the scalars of one step; numbers that are not finite are left out or null."""
+        for sink in self._sinks:
+            sink.write(step, metrics)
 
 
 class Pace:
@@ -209,55 +159,6 @@ def duration(seconds: float) -> str:
     if minutes < 60:
         return f"{minutes} min {rest:02d} s"
     return f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-ID = "wandb.id"
-"""File in a run's folder with the Weights & Biases run ids of its stages."""
-
-
-def require_wandb() -> Any:
-    """Return the module ``wandb``, or raise UserError if it is not installed."""
-    try:
-        return importlib.import_module("wandb")  # the import takes a second, so only on demand
-    except ImportError:
-        raise UserError(
-            "train.wandb needs Weights & Biases, which is not installed: "
-            "pip install 'pewm-jax[wandb]'."
-        ) from None
-
-
-def start_wandb(config: Config, run: Path, stage: Stage) -> Any:
-    """Start or resume the run of a stage in the project ``train.wandb`` of Weights & Biases.
-
-    Raises:
-        UserError: the package is not installed, no user is logged in, or the run cannot be started.
-    """
-    wandb = require_wandb()
-    try:
-        return wandb.init(
-            project=config.train.wandb,
-            name=f"{run.name} {stage.name}",
-            group=run.name,
-            id=f"{_id(run)}-{stage.name}",
-            resume="allow",
-            dir=str(run),
-            config=configuration.to_dict(config),
-            settings=wandb.Settings(console="off"),  # the live view prints already
-        )
-    except wandb.Error as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise UserError(
-            f"Weights & Biases cannot start ({reason}): run `wandb login` first, set "
-            "WANDB_MODE=offline to log locally only, or omit --train.wandb."
-        ) from None
-
-
-def _id(run: Path) -> str:
-    """Return the id stored in the run's folder; create it on first use."""
-    path = run / ID
-    if not path.exists():
-        atomic.write_text(path, uuid.uuid4().hex[:12])
-    return path.read_text("utf-8").strip()
 
 
 FOLDER = "profile"

@@ -23,8 +23,7 @@ from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.loader import BadRecords
 from pewm_jax.memory import feature_cache
-from pewm_jax.train import flops, loading, processes, runs, sharding
-from pewm_jax.train import log as training_log
+from pewm_jax.train import flops, loading, processes, runs, sharding, sinks
 from pewm_jax.train.checkpoint import Checkpoints
 from pewm_jax.train.feed import (
     Feed,
@@ -83,8 +82,7 @@ def train(
     config = runs.resumed(config, log if processes.is_primary() else _silent)
     planned = runs.planned(config)
     loading.require_weights(config)
-    if config.train.wandb:
-        training_log.require_wandb()  # fail before the data are prepared
+    sinks.require_packages(config)  # fail before the data are prepared
     mesh = sharding.make_mesh(arranged=config.train.mesh)
     for stage in planned:
         sharding.require_divisible(config, stage, mesh)

@@ -3,9 +3,10 @@
 ::
 
     runs/demo/config.json           the experiment, written first
-              metrics.jsonl         one line per logged step
+              metrics.jsonl         one line per logged step; as all logs, if `train.log` says so
               tensorboard/          the same for TensorBoard
-              wandb/, wandb.id      the same for Weights & Biases, if `train.wandb` is set
+              rerun/                the same for Rerun
+              wandb/, wandb.id      the same for Weights & Biases
               checkpoints/stage1/   by Orbax, see ``checkpoint``
               previews/             sample pictures
               weights.safetensors   inference weights, written at the end of each stage
@@ -63,7 +64,7 @@ MUTABLE_FIELDS = (
     "train.grace_s",
     "train.log_every",
     "train.preview_every",
-    "train.wandb",
+    "train.log",
 )
 """Settings that may change when a run is resumed: none affects what is learned.
 

@@ -20,7 +20,8 @@ from pewm_jax.data import loader
 from pewm_jax.data.loader import BadRecords
 from pewm_jax.io import atomic
 from pewm_jax.train import chips, feed, processes
-from pewm_jax.train.log import LiveView, MetricsLog, Pace, drop_after
+from pewm_jax.train.log import LiveView, MetricsLog, Pace
+from pewm_jax.train.sinks import drop_after
 from pewm_jax.train.step import Metrics
 from pewm_jax.types import Params
 from pewm_jax.worlds.stages import Stage

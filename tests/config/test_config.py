@@ -187,7 +187,7 @@ def test_what_the_checks_must_not_refuse():
             {"model": {"codec": [1]}},
             "model.codec must be a table of settings, got list",
         ),
-        ({"version": 5}, "of version 5, .* versions up to 4: install a newer pewm_jax"),
+        ({"version": 6}, "of version 6, .* versions up to 5: install a newer pewm_jax"),
         *(({"version": v}, "must be a whole number from 1") for v in (0, -1, "2", 2.0, True, None)),
         ({"version": 2, "dit": {}}, "no setting dit"),
     ],
@@ -296,7 +296,7 @@ def test_every_combination_of_kinds_goes_to_json_and_back(config):
     assert there_and_back(config, Config) == config
 
 
-@pytest.mark.parametrize("version", [2, 3, 4])
+@pytest.mark.parametrize("version", [2, 3, 4, 5])
 def test_a_reader_of_an_earlier_version_is_known_by_its_name_of_now(version):
     reader = {"kind": "attention" if version == 2 else "attend", "looks": 7}
     table = {"version": version, "model": {"memory": {"reader": reader}}}
@@ -389,3 +389,12 @@ def test_large_presets_have_the_decays_of_their_sources():
         "tiny": 0.999,
     }
     assert {name: presets.load(name).train.beta2 for name in decays} == decays
+
+
+def test_a_project_of_wandb_becomes_a_log():
+    whole = configuration.to_dict(Config())
+    whole["version"] = 4
+    del whole["train"]["log"]
+    for project, log in (("", Config().train.log), ("a", ("jsonl", "tensorboard", "wandb:a"))):
+        whole["train"]["wandb"] = project
+        assert configuration.from_dict(Config, whole).train.log == log

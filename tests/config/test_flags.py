@@ -281,3 +281,18 @@ def test_a_kind_may_need_another_setting_to_fit(tmp_path):
     file = tmp_path / "mine.json"
     file.write_text('{"model": {"codec": {"kind": "vae"}, "clip": {"frames": 9}}}')
     assert parse("--config", file) == parse(*kind, *frames)
+
+
+@pytest.mark.parametrize(
+    ("flags", "log"),
+    [
+        (["--log", "none"], ("none",)),
+        (["--log=rerun"], ("rerun",)),
+        (["--train.log", "jsonl", "rerun"], ("jsonl", "rerun")),
+        (["--log", "jsonl", "--train.log", "wandb:a"], ("jsonl", "wandb:a")),
+        (["--train.wandb", "rooms"], ("jsonl", "tensorboard", "wandb:rooms")),
+    ],
+)
+def test_logs_are_chosen_by_one_option(flags, log, capsys):
+    assert parse(*flags).train.log == log
+    assert ("deprecated" in capsys.readouterr().err) == ("--train.wandb" in flags)

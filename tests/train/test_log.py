@@ -2,11 +2,14 @@
 
 import io
 import json
+import sys
 
 import pytest
 from rich.console import Console
 
-from pewm_jax.train import log
+from pewm_jax.config import Config, ConfigError, TrainConfig, UserError
+from pewm_jax.train import log, sinks
+from pewm_jax.train.sinks import drop_after
 from pewm_jax.worlds.pewm.world import STAGES
 
 ONE, TWO = STAGES[:2]
@@ -20,26 +23,31 @@ METRICS = {
 }
 
 
+def metrics_log(run, stage, step, *names):
+    train = TrainConfig(run=str(run), log=names) if names else TrainConfig(run=str(run))
+    return log.MetricsLog(run, stage, step, Config(train=train))
+
+
 def lines(path):
     return [(e["stage"], e["step"]) for e in map(json.loads, path.read_text().splitlines())]
 
 
 def test_what_was_logged_beyond_the_restored_step_is_dropped(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    with log.MetricsLog(tmp_path, ONE, 0) as out:
+    with metrics_log(tmp_path, ONE, 0) as out:
         for step in (1, 2, 3):
             out.write(step, METRICS)
-    with log.MetricsLog(tmp_path, TWO, 0) as out:
+    with metrics_log(tmp_path, TWO, 0) as out:
         for step in (1, 2, 3):
             out.write(step, METRICS)
     with path.open("a") as file:
         file.write('{"stage": 2, "st')
-    with log.MetricsLog(tmp_path, TWO, 2) as out:
+    with metrics_log(tmp_path, TWO, 2) as out:
         assert lines(path) == [(1, 1), (1, 2), (1, 3), (2, 1), (2, 2)]
         out.write(3, METRICS)
     assert lines(path)[-1] == (2, 3)
     assert not list(tmp_path.glob("*.partial"))
-    log.drop_after(path, 1, 1)
+    drop_after(path, 1, 1)
     assert lines(path) == [(1, 1)]
 
 
@@ -47,7 +55,7 @@ def test_a_line_is_json_whatever_the_values(tmp_path):
     def refuse(name):
         raise ValueError(name)
 
-    with log.MetricsLog(tmp_path, ONE, 0) as out:
+    with metrics_log(tmp_path, ONE, 0) as out:
         out.write(1, METRICS | {"loss": float("nan"), "grad_norm": float("inf")})
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
     entry = json.loads(line, parse_constant=refuse)
@@ -56,11 +64,56 @@ def test_a_line_is_json_whatever_the_values(tmp_path):
 
 def test_tensorboard_files_are_written_per_stage(tmp_path):
     for stage in (ONE, TWO):
-        with log.MetricsLog(tmp_path, stage, 0) as out:
+        with metrics_log(tmp_path, stage, 0) as out:
             out.write(1, METRICS)
     for name in ("stage1", "stage2"):
         (events,) = (tmp_path / "tensorboard" / name).glob("events.*")
         assert b"clips_per_second" in events.read_bytes()
+
+
+WRITTEN = {
+    "jsonl": {"metrics.jsonl"},
+    "tensorboard": {"tensorboard"},
+    "rerun": {"rerun"},
+    "none": set(),
+}
+
+
+@pytest.mark.parametrize("names", [("none",), ("jsonl",), ("tensorboard", "jsonl"), ("rerun",)])
+def test_only_the_named_logs_are_written(names, tmp_path):
+    if "rerun" in names:
+        pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    with metrics_log(tmp_path, ONE, 0, *names) as out:
+        out.write(1, METRICS)
+    assert {path.name for path in tmp_path.iterdir()} == set().union(*(WRITTEN[n] for n in names))
+
+
+def test_the_recording_of_a_resumed_stage_is_continued_in_another_file(tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    for first in (0, 2):
+        with metrics_log(tmp_path, ONE, first, "rerun") as out:
+            out.write(first + 1, METRICS | {"loss": float("nan")})
+    files = sorted(path.name for path in (tmp_path / "rerun").iterdir())
+    assert files == ["stage1-0000001.rrd", "stage1-0000003.rrd"]
+    for file in files:
+        content = (tmp_path / "rerun" / file).read_bytes()
+        assert b"grad_norm" in content
+        assert f"{tmp_path.name}-stage1".encode() in content
+
+
+@pytest.mark.parametrize(
+    "names",
+    [(), ("csv",), ("none", "jsonl"), ("jsonl", "jsonl"), ("wandb", "wandb:a"), ("jsonl:",)],
+)
+def test_an_unknown_log_is_refused(names):
+    with pytest.raises(ConfigError, match=r"train.log .* use one or several of jsonl, tensorboard"):
+        TrainConfig(log=names)
+
+
+def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(UserError, match=r"train.log rerun .* pip install 'pewm-jax\[rerun\]'\.$"):
+        sinks.require_packages(Config(train=TrainConfig(log=("rerun",))))
 
 
 def view(total, done=0):

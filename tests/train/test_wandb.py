@@ -1,4 +1,4 @@
-"""Weights & Biases get what TensorBoard gets, when it is asked for; a module stands in for it."""
+"""Weights & Biases get the scalars when asked for; a module stands in for the package."""
 
 import sys
 import types
@@ -50,7 +50,7 @@ def model(monkeypatch):
 
 
 def test_both_stages_send_their_scalars_under_one_name(model, wandb, tmp_path):
-    loop.train(fakes.config(tmp_path / "run", stage1=3, stage2=2, wandb="rooms"))
+    loop.train(fakes.config(tmp_path / "run", stage1=3, stage2=2, log=("wandb:rooms",)))
     one, two = wandb.begun
     assert (one["project"], one["group"], one["dir"]) == ("rooms", "run", str(tmp_path / "run"))
     assert one["id"].removesuffix("stage1") == two["id"].removesuffix("stage2")
@@ -64,7 +64,7 @@ def test_both_stages_send_their_scalars_under_one_name(model, wandb, tmp_path):
 
 
 def test_a_training_that_goes_on_goes_on_in_the_same_run(model, wandb, tmp_path, monkeypatch):
-    config = fakes.config(tmp_path, stage1=6, stage2=0, wandb="rooms")
+    config = fakes.config(tmp_path, stage1=6, stage2=0, log=("wandb:rooms",))
     with monkeypatch.context() as patch:
         patch.setattr(loop.MetricsLog, "write", stop_at(4, loop.MetricsLog.write))
         with pytest.raises(RuntimeError, match="enough"):
@@ -95,17 +95,17 @@ def test_nothing_is_imported_or_written_where_it_is_not_asked_for(model, monkeyp
 def test_without_the_package_the_training_is_refused_before_it_begins(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(UserError, match=r"pip install 'pewm-jax\[wandb\]'\.$"):
-        loop.train(fakes.config(tmp_path / "run", wandb="rooms"))
+        loop.train(fakes.config(tmp_path / "run", log=("wandb:rooms",)))
     assert not (tmp_path / "run").exists()
 
 
 def test_a_login_that_is_missing_is_one_sentence(model, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "wandb", Fake("api_key not configured (no-tty).\ncall login"))
     with pytest.raises(UserError, match="WANDB_MODE=offline") as refusal:
-        loop.train(fakes.config(tmp_path, stage1=1, stage2=0, wandb="rooms"))
+        loop.train(fakes.config(tmp_path, stage1=1, stage2=0, log=("wandb:rooms",)))
     assert "\n" not in str(refusal.value)
 
 
 def test_a_run_may_be_sent_elsewhere_when_it_goes_on(tmp_path):
-    plain, asked = fakes.config(tmp_path), fakes.config(tmp_path, wandb="rooms")
+    plain, asked = fakes.config(tmp_path), fakes.config(tmp_path, log=("wandb:rooms",))
     assert not runs.differences(runs.identity(plain), runs.identity(asked))

@@ -1,0 +1,1 @@
+"""Episodes in the formats of other tools: LeRobot, RLDS, Rerun, point clouds, videos."""
