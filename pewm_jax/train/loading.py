@@ -22,7 +22,7 @@ from pewm_jax.io import weights
 from pewm_jax.memory import feature_cache
 from pewm_jax.train import checkpoint_files, processes, runs
 from pewm_jax.types import Params
-from pewm_jax.worlds import rollouts
+from pewm_jax.worlds import lora, rollouts
 from pewm_jax.worlds.stages import Stage
 
 
@@ -77,13 +77,27 @@ def _read(folder: Path) -> tuple[Config, Params]:
     # Imported here: Orbax takes a second to import, and finished runs do not need it.
     from pewm_jax.train import checkpoint  # noqa: PLC0415
 
-    return checkpoint.read_weights(folder, _shapes)
+    config, params = checkpoint.read_weights(folder, _stored_shapes)
+    if lora.ROOT in params:
+        # The folder is RUN/checkpoints/STAGE/STEP.
+        start = lora.find_base(folder.resolve().parents[2], checkpoint.position(folder))
+        params = lora.merge(rollouts.load_finished(start)[1], params, config.train.lora)
+    return config, params
 
 
 def _shapes(config: Config, number: int) -> Params:
     """Return the shapes of all parameters of a stage."""
-    stage = next(stage for stage in runs.all_stages(config) if stage.number == number)
+    stage = _stage(config, number)
     return jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
+
+
+def _stored_shapes(config: Config, number: int) -> Params:
+    """Return the shapes of the parameters in a stage's checkpoints."""
+    return lora.stored(_stage(config, number), _shapes(config, number))
+
+
+def _stage(config: Config, number: int) -> Stage:
+    return next(stage for stage in runs.all_stages(config) if stage.number == number)
 
 
 def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
@@ -144,7 +158,7 @@ def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Pa
             continue
         later_only = _shapes(config, later.number).keys() - _shapes(config, stage.number).keys()
         extra = later_only & params.keys()
-        if extra:
+        if extra and not stage.stored:  # adapters leave them as they are
             log(
                 f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are ignored; "
                 f"{later.title} initializes new ones"
