@@ -291,9 +291,7 @@ class _Worker:
         self.view.log(f"{stage.title}: resuming after step {done}")
         if not stage.stored or start is None:
             return self.checkpoints.restore(self.like)
-        return self.checkpoints.restore(
-            self.like, start_params(config, stage, self.like, start)
-        )
+        return self.checkpoints.restore(self.like, start_params(config, stage, self.like, start))
 
     def _report(self, step: int, metrics: Metrics, sampled: TrainState | None = None) -> None:
         """Read, check, show and log a step's metrics; make samples if a state is passed."""

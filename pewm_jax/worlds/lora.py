@@ -85,7 +85,9 @@ def _adapted(model: Task, train: TrainSettings, stages: tuple[Stage, ...]) -> St
         if label == FREEZE or any(re.fullmatch(rule, path) for path in leaves)
     ]
     trains = any(label == TRAIN for _, label in rules)
-    candidates = [p for p, shape in shapes.items() if is_matrix(p, shape) and trained_by(p, [stage])]
+    candidates = [
+        p for p, shape in shapes.items() if is_matrix(p, shape) and trained_by(p, [stage])
+    ]
 
     def init(model: Task, key: Array) -> Params:
         return {**stage.init(model, key), **_init(adapted, lora.rank, key)}
@@ -195,7 +197,7 @@ def adapters_of(params: Params) -> Iterator[tuple[str, Array, Array]]:
 
 def takes_deferred(model: Task, path: str) -> bool:
     """Tell whether the network that uses a parameter takes a ``Deferred`` weight there."""
-    part, parts = path.split("/")[0], [model]
+    part, parts = path.split("/", maxsplit=1)[0], [model]
     owners = {
         "backbone": ("backbone",),
         "image": ("backbone",),

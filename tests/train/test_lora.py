@@ -163,7 +163,10 @@ def test_full_parameters_are_trained_beside_adapters(base, tmp_path):
     ("changes", "message"),
     [
         ({"start": ""}, "train.start is empty"),
-        ({"lora": dataclasses.replace(ADAPT, target="kernel")}, "matches no path .*backbone/kernel"),
+        (
+            {"lora": dataclasses.replace(ADAPT, target="kernel")},
+            "matches no path .*backbone/kernel",
+        ),
         ({"start": "nowhere"}, "nowhere has no weights.safetensors"),
     ],
 )
