@@ -99,6 +99,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Refuse: environments are set up when they are made."""
+        del value, indices
         raise UserError(f"{attr_name} of the environments cannot be set: make them with it.")
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
@@ -109,6 +110,7 @@ class GymnasiumVecEnv(VecEnv):
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
         """Return False for every environment."""
+        del wrapper_class
         return [False for _ in self._get_indices(indices)]
 
 

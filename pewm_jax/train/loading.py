@@ -22,22 +22,30 @@ from pewm_jax.io import weights
 from pewm_jax.memory import feature_cache
 from pewm_jax.train import checkpoint_files, processes, runs
 from pewm_jax.types import Params
-from pewm_jax.worlds import lora, rollouts
+from pewm_jax.worlds import lora, quantized, rollouts
 from pewm_jax.worlds.stages import Stage
 
 
-def load(path: str | Path) -> tuple[Config, Params]:
+def load(path: str | Path, *, quantize: str = "") -> tuple[Config, Params]:
     """Load a world model: the experiment, and its averaged (EMA) inference weights in NumPy arrays.
 
     Args:
         path: one of: a run folder made by ``train.py``, finished or not (the newest weights are
             loaded; while a stage is being trained, those of its newest complete checkpoint); a
             checkpoint folder, such as ``runs/demo/checkpoints/stage1/200``; a folder of converted
-            weights; the name of weights that ship with the library (``shipped.names()``).
+            weights; the name of weights that ship with the library (``shipped.names()``). A run
+            that trained adapters is loaded with the weights that they adapt.
+        quantize: ``int8`` or ``fp8`` keeps the kernels of the denoiser in 8 bits
+            (``worlds.quantized``).
 
     Raises:
         UserError: a file is missing or damaged, or the weights do not fit the configuration.
     """
+    config, params = _load(path)
+    return config, quantized.quantize(config.model, params, quantize)
+
+
+def _load(path: str | Path) -> tuple[Config, Params]:
     if not isinstance(path, str | os.PathLike):
         raise UserError(
             f"load() got a path of type {type(path).__name__}: pass the folder of a run, or the "

@@ -33,7 +33,7 @@ import numpy as np
 
 from pewm_jax import shipped
 from pewm_jax.config import Config, LoRAConfig, Task, TrainSettings, UserError
-from pewm_jax.io import tensor_files, tree
+from pewm_jax.io import tensor_files, tree, weights
 from pewm_jax.io.store import file_hash
 from pewm_jax.nn.deferred import LowRank, is_matrix, is_stacked
 from pewm_jax.types import Array, Clip, Params
@@ -301,6 +301,20 @@ def with_new_parameters(
     log(f"{config.train.start} lacks {tree.listing(more)}: trained in full, besides the adapters")
     full = dataclasses.replace(lora, full=(*lora.full, *sorted(more)))
     return dataclasses.replace(config, train=dataclasses.replace(config.train, lora=full))
+
+
+def require_whole(folder: Path) -> None:
+    """Refuse a folder of adapters where whole weights are read.
+
+    Raises:
+        UserError: it holds adapters alone.
+    """
+    path = folder / _WEIGHTS
+    if path.is_file() and BASE_HASH in weights.metadata(path):
+        raise UserError(
+            f"{folder} holds adapters alone: merge them by `pewm-jax convert merge {folder} DST` "
+            "first."
+        )
 
 
 def find_base(folder: Path, facts: dict[str, str]) -> Path:
