@@ -7,7 +7,6 @@ import dataclasses
 import sys
 
 import numpy as np
-import torch
 from gymnasium.vector import AutoresetMode
 from scipy.stats import binomtest
 from stable_baselines3 import PPO
@@ -18,7 +17,7 @@ from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.planning.imagined_vector import ImaginedVectorEnv
 from pewm_jax.planning.stable_baselines import GymnasiumVecEnv
 
-STEPS, TASKS, WORLDS = int(sys.argv[1]) if len(sys.argv) > 1 else 16384, 96, 8
+STEPS, TASKS, WORLDS = int(sys.argv[1]) if len(sys.argv) > 1 else 8192, 96, 8
 GOALS = HouseConfig(max_distance_m=4.0, max_steps=48)
 PRACTISED = [dataclasses.replace(GOALS, house=3 * n, houses=4) for n in range(WORLDS)]
 TESTED = [dataclasses.replace(GOALS, house=2 + 3 * n) for n in range(12)]  # held out
@@ -45,16 +44,16 @@ def successes(act):
     return np.array(solved)
 
 
-torch.set_num_threads(1)
 config, params = pewm_jax.load("small")
-config = config.with_model(**vars(config.model.with_sample_steps(2)))
+model = config.model.with_sample_steps(1)
+model = dataclasses.replace(model, clip=dataclasses.replace(model.clip, frames=2))  # one action
 worlds = ImaginedVectorEnv(
-    config, params, WORLDS, PRACTISED, autoreset_mode=AutoresetMode.DISABLED, blocks=True
+    model, params, WORLDS, PRACTISED, autoreset_mode=AutoresetMode.DISABLED, blocks=True
 )
-policy = PPO("MlpPolicy", GymnasiumVecEnv(worlds, look), n_steps=128, batch_size=256, seed=0)
+policy = PPO("MlpPolicy", GymnasiumVecEnv(worlds, look), 1e-3, 64, 128, gamma=0.95, seed=0)
 policy.learn(STEPS)
 trained = successes(lambda s: policy.predict(look({k: v[None] for k, v in s.items()}))[0][0])
-chance = successes(lambda _, rng=np.random.default_rng(0): rng.integers(3))
+chance = successes(lambda _, draw=np.random.default_rng(0).integers: draw(3))
 better, worse = (trained & ~chance).sum(), (chance & ~trained).sum()
 p = binomtest(better, better + worse, alternative="greater").pvalue if better + worse else 1.0
 print(f"solved {trained.sum()}, by chance {chance.sum()} of {len(chance)} tasks; p = {p:.1e}")
