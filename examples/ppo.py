@@ -53,7 +53,8 @@ worlds = ImaginedVectorEnv(
 policy = PPO("MlpPolicy", GymnasiumVecEnv(worlds, look), 1e-3, 64, 128, gamma=0.95, seed=0)
 policy.learn(STEPS)
 trained = successes(lambda s: policy.predict(look({k: v[None] for k, v in s.items()}))[0][0])
-chance = successes(lambda _, draw=np.random.default_rng(0).integers: draw(3))
+rng = np.random.default_rng(0)
+chance = successes(lambda _: rng.integers(3))
 better, worse = (trained & ~chance).sum(), (chance & ~trained).sum()
 p = binomtest(better, better + worse, alternative="greater").pvalue if better + worse else 1.0
 print(f"solved {trained.sum()}, by chance {chance.sum()} of {len(chance)} tasks; p = {p:.1e}")

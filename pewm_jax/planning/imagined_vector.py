@@ -13,12 +13,9 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space
 
 from pewm_jax import worlds
 from pewm_jax.config import Config, World
@@ -27,8 +24,10 @@ from pewm_jax.nn import target
 from pewm_jax.planning import imagined
 from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.planning.imagined_env import WorldModelEnv
+from pewm_jax.planning.observations import gymnasium
 from pewm_jax.types import Array, Params
 
+AutoresetMode = gymnasium.vector.AutoresetMode
 Observations = dict[str, np.ndarray]
 
 
@@ -80,8 +79,10 @@ class ImaginedVectorEnv(gymnasium.vector.VectorEnv):
         self.envs = [WorldModelEnv(model, params, one, **settings) for one in houses]
         self.single_observation_space = self.envs[0].observation_space
         self.single_action_space = self.envs[0].action_space
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = gymnasium.vector.utils.batch_space(
+            self.single_observation_space, num_envs
+        )
+        self.action_space = gymnasium.vector.utils.batch_space(self.single_action_space, num_envs)
         self.render_mode = settings.get("render_mode")
         self._over = np.ones(num_envs, bool)
         self._restarts = autoreset_mode == AutoresetMode.NEXT_STEP
