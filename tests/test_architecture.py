@@ -63,6 +63,7 @@ HOMES = {
     "pickle": {"io/pickles"},
     "ray": {"data/collect"},
     "safetensors": {"io/tensor_files", "io/weights", "convert"},
+    "stable_baselines3": {"planning/stable_baselines"},
     "scipy": {"data", "eval/statistics", "houses"},
     "tensorboardX": {"train/log"},
     "torch": {"convert", "eval/metrics/sam2"},

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode
 
 from pewm_jax.errors import UserError, require
+from pewm_jax.planning.observations import gymnasium
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -42,7 +41,7 @@ class GymnasiumVecEnv(VecEnv):
         """
         mode = envs.metadata.get("autoreset_mode")
         require(
-            mode == AutoresetMode.DISABLED,
+            mode == gymnasium.vector.AutoresetMode.DISABLED,
             f"the environments' autoreset_mode is {mode}: use AutoresetMode.DISABLED.",
         )
         self.envs, self._look = envs, look or (lambda seen: seen)

@@ -89,7 +89,8 @@ def _read(folder: Path) -> tuple[Config, Params]:
     if lora.ROOT in params:
         # The folder is RUN/checkpoints/STAGE/STEP.
         start = lora.find_base(folder.resolve().parents[2], checkpoint.position(folder))
-        params = lora.merge(rollouts.load_finished(start)[1], params, config.train.lora)
+        base = rollouts.load_finished(start)[1]
+        params = lora.merge(base, params, config.train.lora, config.model.dtype)
     return config, params
 
 

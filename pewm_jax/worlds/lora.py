@@ -212,8 +212,10 @@ def takes_deferred(model: Task, path: str) -> bool:
     return path.endswith("/kernel") and all(map(is_of_this_package, parts))
 
 
-def merge(base: Params, params: Params, lora: LoRAConfig) -> Params:
+def merge(base: Params, params: Params, lora: LoRAConfig, dtype: Any = None) -> Params:
     """Return start weights with adapters, and parameters trained themselves, in NumPy arrays.
+
+    A sum is in the precision of its start weight, or in ``dtype``, the model's, if that is wider.
 
     Raises:
         TreeError: an adapter fits no start weight.
@@ -224,18 +226,20 @@ def merge(base: Params, params: Params, lora: LoRAConfig) -> Params:
     for path, a, b in adapters_of(params):
         if path not in leaves or leaves[path].shape[:-1] != a.shape[:-1]:
             raise tree.TreeError(f"The adapter of {path} does not fit the start weights.")
-        leaves[path] = _sum(leaves[path], np.asarray(a), np.asarray(b), lora.scale)
+        stored = leaves[path].dtype
+        wide = np.dtype(jnp.promote_types(stored, dtype or stored))
+        leaves[path] = _sum(leaves[path], np.asarray(a), np.asarray(b), lora.scale, wide)
     return tree.unflatten(leaves)
 
 
-def _sum(base: Any, a: np.ndarray, b: np.ndarray, scale: float) -> np.ndarray:
-    """Return ``LowRank`` on the host, layer by layer if they are stacked, in the base's dtype."""
+def _sum(base: Any, a: np.ndarray, b: np.ndarray, scale: float, dtype: np.dtype) -> np.ndarray:
+    """Return ``LowRank`` on the host, layer by layer if they are stacked."""
     if b.ndim == 3:
         layers = zip(base, a, b, strict=True)
-        return np.stack([_sum(*layer, scale) for layer in layers])
+        return np.stack([_sum(*layer, scale, dtype) for layer in layers])
     delta = a.astype(np.float32) @ b.astype(np.float32)
     whole = np.asarray(base)
-    return (whole.astype(np.float32) + np.float32(scale) * delta).astype(whole.dtype)
+    return (whole.astype(np.float32) + np.float32(scale) * delta).astype(dtype)
 
 
 def base_hash(folder: Path) -> str:

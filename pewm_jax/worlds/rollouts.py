@@ -47,7 +47,8 @@ def load_finished(
     params = (weights.lazy if lazily else weights.load)(file)
     if lora.ROOT in params:
         start = lora.find_base(folder, weights.metadata(file))
-        params = lora.merge(load_finished(start, lazily=lazily)[1], params, config.train.lora)
+        base = load_finished(start, lazily=lazily)[1]
+        params = lora.merge(base, params, config.train.lora, config.model.dtype)
     expected = _expected(config, params)
     weights.check(params, expected, str(file))
     return config, params
