@@ -30,6 +30,7 @@ KEY = jax.random.key(0)
 def experiments():
     tiny = presets.load("tiny")
     train = dataclasses.replace(tiny.train, lora=ADAPT)
+    every = dataclasses.replace(ADAPT, target=r".*")
     plugin = parts.experiment()
     return {
         "cogvideox": dataclasses.replace(tiny, train=train),
@@ -40,7 +41,7 @@ def experiments():
             data=DataConfig(context=1),
             train=PersistTrainConfig(lora=ADAPT),
         ),
-        "plugin": dataclasses.replace(plugin, train=dataclasses.replace(plugin.train, lora=ADAPT)),
+        "plugin": dataclasses.replace(plugin, train=dataclasses.replace(plugin.train, lora=every)),
     }
 
 
@@ -58,6 +59,8 @@ def clip(config, batch=1, seed=0):
 
     def posed(frames):
         *lead, height, width = frames.depth_THW.shape
+        if not np.prod(lead):
+            return frames
         cameras = random_camera(rng, int(np.prod(lead)), height, width, upright=True)
         cameras = jax.tree.map(
             lambda x: np.asarray(x, np.float32).reshape(*lead, *x.shape[1:]), cameras
