@@ -66,6 +66,7 @@ HOMES = {
     "ray": {"data/collect"},
     "rerun": {"data/exports/recording", "train/sinks"},
     "safetensors": {"io/tensor_files", "io/weights", "convert"},
+    "stable_baselines3": {"planning/stable_baselines"},
     "scipy": {"data", "eval/statistics", "houses"},
     "tensorboardX": {"data/exports/rlds", "train/sinks"},
     "torch": {"convert", "eval/metrics/sam2"},

@@ -22,7 +22,7 @@ from pewm_jax.io import runtime
 JOIN = Join()
 SCORED = (
     *("split", "clips", "seeds", "chain", "stride", "videos", "video_clips", "batch"),
-    *("none", "lpips", "protocol", "fvd", "mirror", "src", "scs"),
+    *("none", "lpips", "protocol", "fvd", "mirror", "src", "scs", "quantize"),
 )
 """Settings of ``EvalConfig`` that are flags of ``evaluate``."""
 CHOSEN = ("split", "clips", "seeds", "chain", "stride", "video_clips")

@@ -147,6 +147,16 @@ COMMANDS = {
         f"{CONVERT}.options:ImportCosmos2",
         f"{CONVERT}.commands:import_cosmos2",
     ),
+    "convert import lora": Command(
+        "LoRA adapters of peft or diffusers → adapters on imported weights",
+        f"{CONVERT}.options:ImportLoRA",
+        f"{CONVERT}.commands:import_lora",
+    ),
+    "convert merge": Command(
+        "a run that trained adapters → plain weights",
+        f"{CONVERT}.options:Merge",
+        f"{CONVERT}.commands:merge",
+    ),
     "convert export diffusers": Command(
         "our CogVideoX weights, before or after fine-tuning → a folder for from_pretrained",
         f"{CONVERT}.options:ExportDiffusers",
@@ -182,7 +192,7 @@ COMMANDS = {
 GROUPS = {
     "data": "collect, import, validate, show and export episodes",
     "memory": "compute the image encoder's features of a data set once",
-    "convert": "import CogVideoX, SVD, Cosmos or DINOv2, export trained weights",
+    "convert": "import CogVideoX, SVD, Cosmos or DINOv2, merge adapters, export trained weights",
     "convert import": "read a checkpoint of another library",
     "convert export": "write weights for another program",
 }

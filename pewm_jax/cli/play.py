@@ -7,7 +7,7 @@ import functools
 import os
 import threading
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -30,6 +30,8 @@ class Settings(Start, Serve):
         kw_only=True
     )
     """A run's folder, an export, or the name of a model that ships with the library."""
+    quantize: Literal["", "int8", "fp8"] = ""
+    """Keep the weights of the denoiser in 8 bits; if empty, they stay as they are."""
 
     def __post_init__(self):
         """Validate."""
@@ -55,7 +57,9 @@ def run(settings: Settings) -> None:
     _require_usable(settings)
     folder = settings.worlds or home / "worlds"
     name, say = Path(model).name, functools.partial(print, flush=True)
-    page = pages.Page(lambda: _load(model, home), settings, settings, folder, name, say)
+    page = pages.Page(
+        lambda: _load(model, home, settings.quantize), settings, settings, folder, name, say
+    )
     try:
         if settings.open:
             serving.open_in_browser(page.url)
@@ -89,10 +93,10 @@ def _require_usable(settings: Settings) -> None:
             )
 
 
-def _load(name: str, home: Path):
+def _load(name: str, home: Path, quantize: str = ""):
     """Load the model, and enable the compilation cache."""
     from pewm_jax.play.engine import open_engine
     from pewm_jax.train.loading import load
 
     runtime.cache_compilation(home.parent)
-    return open_engine(Path(name).name, *load(name))
+    return open_engine(Path(name).name, *load(name, quantize=quantize))

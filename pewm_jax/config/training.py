@@ -129,6 +129,43 @@ class StageConfig:
 
 
 @dataclasses.dataclass(frozen=True)
+class LoRAConfig:
+    """Low-rank adapters, which are trained in place of the weights."""
+
+    rank: int = 0
+    """Rank of the adapters; 0 trains the weights themselves. Adapters need weights to start from,
+    which stay as they are: `train.start`, a folder with weights.safetensors."""
+    alpha: float = 0.0
+    """An adapter is multiplied by alpha / rank; 0 means the rank, that is a factor of 1."""
+    target: str = r".*/to_(q|k|v|out)/kernel"
+    """Regular expression for whole paths of the matrices and convolutions that get an adapter, such
+    as `backbone/blocks/to_q/kernel`; by default the projections of attention. Of these, each stage
+    trains those that it would train without adapters. `.*` is all of them."""
+    full: tuple[str, ...] = ()
+    """Paths (regular expressions) of parameters that are trained themselves, besides the adapters,
+    and are saved with them. Parameters of a stage that the start weights lack are added."""
+
+    def __post_init__(self):
+        """Validate."""
+        require(self.rank >= 0, f"train.lora.rank is {self.rank}: use 0 (none) or more.")
+        require(
+            self.alpha >= 0 and math.isfinite(self.alpha),
+            f"train.lora.alpha is {self.alpha}: use 0 (the rank) or more.",
+        )
+        for name, patterns in (("target", (self.target,)), ("full", self.full)):
+            for pattern in patterns:
+                require(
+                    is_pattern(pattern),
+                    f"train.lora.{name}: {pattern!r} is no regular expression.",
+                )
+
+    @property
+    def scale(self) -> float:
+        """Return the factor of an adapter."""
+        return (self.alpha or self.rank) / max(self.rank, 1)
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainSettings:
     """Settings of all trainings; each world adds a ``StageConfig`` for each of its stages."""
 
@@ -178,6 +215,8 @@ class TrainSettings:
     log is written. All are in the run's folder, and no others are written."""
     mesh: MeshConfig = MeshConfig()
     """How devices are arranged; may differ each time a run is resumed."""
+    lora: LoRAConfig = LoRAConfig()
+    """Train low-rank adapters in place of the weights."""
     fresh: tuple[str, ...] = (r"memory/.*",)
     """Parameter paths (regular expressions) that may be missing from the weights a stage starts
     from; these parameters start at random."""
@@ -339,6 +378,9 @@ class EvalConfig:
     """Segmenter of SCS, for episodes with instance ids: a folder with SAM 2 (`pip install
     'pewm-jax[sam2]'`), or `flow`, optical flow, which needs no weights; `off` leaves SCS out; if
     empty, it is measured with `flow` where the episodes have instance ids."""
+    quantize: Literal["", "int8", "fp8"] = ""
+    """Keep the weights of the denoiser in 8 bits, with one scale for each output channel: `int8` or
+    `fp8`; if empty, they stay as they are. The report has a folder of its own."""
     protocol: str = ""
     """File written by `pewm-jax protocol` before training: the clips that are scored, with their
     context, motion and noise; it stands above the settings here. If empty, or `off`, clips are

@@ -40,6 +40,7 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
 from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.types import Params
+from pewm_jax.worlds import lora
 from pewm_jax.worlds.pewm import paper
 
 PIPELINES = (
@@ -374,6 +375,7 @@ def _run(src: Path, network: Network, record: dict[str, Any]) -> Params:
     """Return the video model's part of a world model."""
     config = configuration.load(src / CONFIG, Config)
     path = src / WEIGHTS
+    lora.require_whole(src)
     if network is VAE:
         params = weights.load(path, "codec")
     else:

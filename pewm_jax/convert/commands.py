@@ -11,6 +11,7 @@ import numpy as np
 from pewm_jax.config import Config, UserError
 from pewm_jax.config.overlay import overlay
 from pewm_jax.convert import (
+    adapters,
     cogvideox,
     cosmos,
     dinov2,
@@ -28,7 +29,9 @@ from pewm_jax.convert.options import (
     ImportCogVideoX,
     ImportCosmos2,
     ImportDINOv2,
+    ImportLoRA,
     ImportSVD,
+    Merge,
 )
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import hub
@@ -211,6 +214,17 @@ def import_cosmos2(options: ImportCosmos2) -> None:
     prompts = "prompts encoded" if encoded else "no prompt (there is no text_encoder/)"
     licence = cogvideox.licence(options.src)
     print(f"{options.dst}: a world model, {prompts}; licence of the original: {licence}")
+
+
+def import_lora(options: ImportLoRA) -> None:
+    """Run ``import lora``."""
+    print(f"{options.dst}: {adapters.import_adapters(options.src, options.dst, options.base)}")
+
+
+def merge(options: Merge) -> None:
+    """Run ``merge``."""
+    adapters.merge(options.src, options.dst)
+    print(f"{options.dst} is ready: pewm_jax.load({str(options.dst)!r})")
 
 
 def export_diffusers(options: ExportDiffusers) -> None:

@@ -71,7 +71,7 @@ def export(
                 f"{run} contains a {kinds.of(config.model).name}, which has no inference form: copy"
                 " its config.json and weights.safetensors, which pewm_jax.load reads."
             )
-        origin = _base(run, config)
+        origin = base_record(run, config)
         metadata = weights.metadata(run / runs.WEIGHTS)
         facts = CardFacts(
             name=name or dst.name,
@@ -131,7 +131,7 @@ def _write(path: Path, params: Params, metadata: Mapping[str, str], dtype: Any) 
     tensor_files.write(path, like, narrowed(), tensor_files.header(metadata))
 
 
-def _base(run: Path, config: Config) -> Path | None:
+def base_record(run: Path, config: Config) -> Path | None:
     """Return the ``base.json`` of the run, or of the folder it started from, if there is one."""
     places = [run, *([Path(config.train.start)] if config.train.start else [])]
     found = [place / runs.BASE for place in places if (place / runs.BASE).is_file()]

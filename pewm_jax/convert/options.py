@@ -149,6 +149,38 @@ class ImportCosmos2:
 
 
 @dataclasses.dataclass(frozen=True)
+class ImportLoRA:
+    """Import LoRA adapters that peft or diffusers wrote, for CogVideoX, SVD or Cosmos-Predict2.
+
+    The result is a folder of adapters that refers to its base: `pewm_jax.load` reads it, `pewm-jax
+    convert merge` writes it as plain weights, and `train.start` accepts it. If the base is a folder
+    of `import cogvideox` without --rgbd --camera, the result is a copy of it with merged weights.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """The file of the adapters, or a folder with pytorch_lora_weights.safetensors or
+    adapter_model.safetensors."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to create."""
+    base: Path
+    """Folder of the weights that they adapt, made by `pewm-jax convert import`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Merge:
+    """Merge the adapters of a run into the weights that they adapt.
+
+    The result is a plain folder, with the same predictions, which `pewm_jax.load` reads and
+    `train.start` accepts.
+    """
+
+    src: Annotated[Path, tyro.conf.Positional]
+    """The run's folder, or a folder made by `pewm-jax convert import lora`."""
+    dst: Annotated[Path, tyro.conf.Positional]
+    """Folder to create."""
+
+
+@dataclasses.dataclass(frozen=True)
 class ExportDiffusers:
     """Write a folder for the from_pretrained of diffusers.
 

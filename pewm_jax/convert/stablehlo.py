@@ -53,7 +53,7 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.nn import target
 from pewm_jax.train import runs
 from pewm_jax.types import Array, Camera, Control, MemoryReadout, Params
-from pewm_jax.worlds import rollouts, world_model
+from pewm_jax.worlds import lora, rollouts, world_model
 
 Arrays: TypeAlias = dict[str, Array]
 """Name → array, or anything with a shape and a dtype."""
@@ -271,6 +271,7 @@ def export(
             the check fails.
     """
     _check_arguments(run, clips, frames, platforms)
+    lora.require_whole(run)
     with pipeline.new_folder(dst) as folder:
         log(f"reading {run} …")
         config, params = rollouts.load_finished(run)

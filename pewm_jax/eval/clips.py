@@ -226,6 +226,8 @@ def fingerprint(
         settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)
+    if not settings["evaluate"]["quantize"]:
+        del settings["evaluate"]["quantize"]  # so that earlier hashes stay valid
     settings["context"] = config.data.context
     content = {"version": VERSION, "settings": settings, "weights": weights, "data": dataset}
     content["lpips"] = lpips

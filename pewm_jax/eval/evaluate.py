@@ -198,6 +198,7 @@ def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
         ids=all(episodes[index].has_ids for index in range(len(episodes))),
     )
     validation = reproject.data_hash(config)
+    loaded = runs.with_precision(loaded, config.evaluate.quantize)
     return _Job(
         loaded, has_memory, none, config, protocol, episodes, metrics, validation, data_hash
     )

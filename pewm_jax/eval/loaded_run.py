@@ -12,7 +12,7 @@ from pewm_jax.io import weights
 from pewm_jax.io.store import file_hash
 from pewm_jax.train import runs
 from pewm_jax.types import Params
-from pewm_jax.worlds import require_world
+from pewm_jax.worlds import quantized, require_world
 from pewm_jax.worlds.rollouts import load_finished
 
 WEIGHTS = "weights.safetensors"
@@ -67,6 +67,12 @@ def open_run(run: str | Path, config: Config | None = None) -> LoadedRun:
     return LoadedRun(folder, shipped.home(run), config, params, file_hash(folder / WEIGHTS))
 
 
+def with_precision(loaded: LoadedRun, precision: str) -> LoadedRun:
+    """Return a run with weights in 8 bits, as for ``pewm_jax.load``; "" leaves them unchanged."""
+    params = quantized.quantize(loaded.config.model, loaded.params, precision)
+    return dataclasses.replace(loaded, params=params)
+
+
 def has_memory(loaded: LoadedRun) -> bool:
     """Return whether a run's model has a memory; False if it was trained without one by intent.
 
@@ -105,13 +111,15 @@ def _require_all_steps(loaded: LoadedRun) -> None:
 
 
 def report_folder(loaded: LoadedRun, config: Config) -> Path:
-    """Return the folder of a report: ``report``, or ``report-NAME`` for other data."""
+    """Return the folder of a report: ``report``, or ``report-NAME`` for other data or weights."""
     data, split = Path(config.data.path), config.evaluate.split
     other = []
     if data.resolve() != Path(loaded.config.data.path).resolve():
         other.append(data.resolve().name)
     if split != loaded.config.evaluate.split:
         other.append(split.strip("/").replace("/", "-") or "all")
+    if config.evaluate.quantize:
+        other.append(config.evaluate.quantize)
     return loaded.home / "-".join([OWN, *other])
 
 

@@ -185,6 +185,8 @@ def _plan_on_target(
 ) -> tuple[StageReport, Iterator[str]]:
     """Return what a chip's compiler says about a stage, and its lines."""
     log(f"{stage.title}: compiling the real step for {sizes.devices} × {chip.name} …")
+    if config.train.lora.rank:
+        log(f"{stage.title}: {adapters(config, stage)}")
     report = target_compiler.compile_stage(config, stage.name, chip, launch.devices)
     return report, report_lines(report, stage.title, stage.settings(config).batch)
 
@@ -271,6 +273,8 @@ def lines(plan: StagePlan) -> Iterator[str]:
         f"{arranged(choice.mesh.sizes)}; {clips} clips per step, "
         f"{clips / choice.mesh.batch:g} per device"
     )
+    if plan.config.train.lora.rank:
+        yield f"  {adapters(plan.config, plan.stage)}"
     yield "  memory of a device"
     for label, name in MEMORY:
         value = getattr(choice.memory, name)
@@ -313,6 +317,16 @@ def lines(plan: StagePlan) -> Iterator[str]:
         yield (
             f"    {duration(best.time.step_s)}/step, {size(best.memory.peak)}, {fits}: {best.flags}"
         )
+
+
+def adapters(config: Config, stage: Stage) -> str:
+    """Return a sentence about the parameters that a stage with adapters trains."""
+    c = suggest.counts(config, stage)
+    total = sum(part.count for part in c.values())
+    return (
+        f"adapters of rank {config.train.lora.rank}: {c['trained'].count:,} of {total:,} "
+        "parameters are trained and have an optimizer state"
+    )
 
 
 def report_lines(report: StageReport, title: str, clips: int = 0) -> Iterator[str]:

@@ -55,6 +55,7 @@ class GPU:
     device_memory_size: int
     capability: int
     description: str
+    minor: int = 0
 
 
 _H100 = GPU(
@@ -81,6 +82,19 @@ GPUS = {
         device_memory_size=85100068864,
         capability=8,
         description="NVIDIA A100-SXM4-80GB",
+    ),
+    "rtx4090": GPU(
+        core_count=128,
+        fpus_per_core=128,
+        shared_memory_per_core=102400,
+        shared_memory_per_block_optin=101376,
+        memory_bandwidth=1008096000000,
+        l2_cache_size=75497472,
+        clock_rate_ghz=2.52,
+        device_memory_size=25757220864,
+        capability=8,
+        minor=9,
+        description="NVIDIA GeForce RTX 4090",
     ),
     "h100": _H100,
     "h200": dataclasses.replace(
@@ -209,6 +223,8 @@ def target_config(gpu: GPU) -> str:
     """Return XLA's ``GpuTargetConfigProto`` of a GPU in text form."""
     own = dataclasses.asdict(gpu)
     capability, description = own.pop("capability"), own.pop("description")
+    minor = own.pop("minor")
+    minor = f" minor: {minor}" if minor else ""
     common = {
         "threads_per_block_limit": 1024,
         "threads_per_warp": 32,
@@ -222,7 +238,7 @@ def target_config(gpu: GPU) -> str:
     }
     fields = " ".join(f"{name}: {value}" for name, value in {**own, **common}.items())
     return (
-        f"gpu_device_info {{ {fields} cuda_compute_capability {{ major: {capability} }} }} "
+        f"gpu_device_info {{ {fields} cuda_compute_capability {{ major: {capability}{minor} }} }} "
         'runtime_version { major: 12 minor: 8 patch: 0 } platform_name: "CUDA" '
         f'dnn_version_info {{ major: 9 minor: 7 }} device_description_str: "{description}"'
     )

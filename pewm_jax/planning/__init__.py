@@ -7,7 +7,8 @@ Environments:
 * ``observations``: observation spaces, and conversion of observations to the frames that worlds
   take;
 * ``imagined``, ``imagined_env``: any world as an environment, as pure functions and as a Gymnasium
-  environment with the interface of a house;
+  environment with the interface of a house; ``imagined_vector``: many of them, imagined in one
+  call; ``stable_baselines``: these for Stable-Baselines3;
 * ``nomad_policy``: trajectories proposed by a learned policy (``models.nomad``); ``practice``:
   walks of a policy inside a world, as training data;
 * ``scores``: trajectory errors, success and SPL.

@@ -10,7 +10,8 @@ reached when it is at most ``cost_at_most``.
 
 ``info`` contains ``position_error``, ``yaw_error``, ``success``, ``steps``, ``path_length`` and
 ``goal_pose`` as in the house, and ``cost`` if one is given. There are no collisions, and a goal on
-the other side of a wall may count as reached.
+the other side of a wall may count as reached; with ``blocks``, obstacles that were seen at the
+start block a move.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ from pewm_jax import worlds
 from pewm_jax.codecs.signals import rgb_from_signal
 from pewm_jax.config import Config, UserError, World
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
+from pewm_jax.data.trajectories import advance
 from pewm_jax.planning import imagined, observations, scores
 from pewm_jax.planning.house import HouseEnv
 from pewm_jax.planning.house_config import HouseConfig
 from pewm_jax.planning.observations import GoalEnv
+from pewm_jax.planning.practice import FloorMap
 from pewm_jax.types import Frames, Params
 
 
@@ -47,6 +50,7 @@ class WorldModelEnv(GoalEnv):
         *,
         cost: Callable[[np.ndarray], float] | None = None,
         cost_at_most: float = 0.0,
+        blocks: bool = False,
         render_mode: str | None = None,
     ):
         """Wrap a trained world, as returned by ``pewm_jax.load``.
@@ -59,6 +63,8 @@ class WorldModelEnv(GoalEnv):
             cost: a cost that defines the goal: image (H, W, 3) uint8 → cost. By default the goal is
                 a pose.
             cost_at_most: the goal is reached when the cost is at most this.
+            blocks: whether obstacles in the depth of the first frames block a move: the agent then
+                stays (``practice.FloorMap``).
             render_mode: None or "rgb_array".
 
         Raises:
@@ -76,10 +82,11 @@ class WorldModelEnv(GoalEnv):
         of_model |= {"step_m": actions.step_m, "turn_deg": actions.turn_deg}
         config = dataclasses.replace(house or HouseConfig(), **of_model)
         super().__init__(config, render_mode, "the world")
-        self._cost, self._cost_at_most = cost, cost_at_most
+        self._cost, self._cost_at_most, self._blocks = cost, cost_at_most, blocks
+        self.floor: FloorMap | None = None
         self._house: HouseEnv | None = None
         self._house_seed: int | None = None
-        self._state: imagined.ImaginedState | None = None
+        self.state: imagined.ImaginedState | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -99,10 +106,13 @@ class WorldModelEnv(GoalEnv):
         frames, self._goal = self._begin(options or {})
         self.intrinsics_4 = np.asarray(frames.camera.intrinsics_4[-1], np.float32)
         self._key = jax.random.key(int(self.np_random.integers(2**31)))
+        self.floor = FloorMap() if self._blocks else None
+        if self.floor is not None:
+            self.floor.add(frames)
         state = imagined.reset(self._model, self._params, frames, self._key)
         self._begin_episode()
         self._look(imagined.observation(state))
-        self._state = state
+        self.state = state
         self._left = self._measure()
         return self._observation(), self._info()
 
@@ -112,11 +122,28 @@ class WorldModelEnv(GoalEnv):
         Raises:
             UserError: the action is not in the space, or there is no episode.
         """
+        move, key = self.motion(action)
+        assert self.state is not None
+        self.state, seen = imagined.step(self._model, self._params, self.state, move, key)
+        return self.arrive(seen)
+
+    def motion(self, action: Any) -> tuple[np.ndarray, jax.Array]:
+        """Return the (3,) motion of an action, zero if it is blocked, and the key of its noise.
+
+        Raises:
+            UserError: as for ``step``.
+        """
         self._require_episode()
-        assert self._state is not None
         move = observations.require_action(self.config, action).astype(np.float32)
-        key = jax.random.fold_in(self._key, self._steps)
-        self._state, seen = imagined.step(self._model, self._params, self._state, move, key)
+        here = observations.planar_of(self._seen["pose"])
+        if self.floor is not None and not self.floor.free(here[:2], advance(here, move)[:2]):
+            move = np.zeros_like(move)
+        return move, jax.random.fold_in(self._key, self._steps)
+
+    def arrive(
+        self, seen: dict[str, Any]
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Return the results of a step that leads to an observation, which somebody imagined."""
         before = self._seen["pose"]
         self._look(seen)
         self._steps += 1

@@ -33,6 +33,7 @@ from pewm_jax.io import tree
 from pewm_jax.train import checkpoint_files, processes, runs
 from pewm_jax.train.step import TrainState, inference_params
 from pewm_jax.types import Params
+from pewm_jax.worlds import lora
 from pewm_jax.worlds.stages import Stage
 
 WEIGHTS_ITEM = checkpoint_files.WEIGHTS_ITEM
@@ -101,9 +102,10 @@ class Checkpoints:
             "seed": self.stage.data_seed(self.config),
             "batch": settings.batch,
             "clips": step * settings.batch,
+            **lora.reference(self.config),
         }
         items = {
-            WEIGHTS_ITEM: ocp.args.StandardSave(inference_params(self.stage, state)),
+            WEIGHTS_ITEM: ocp.args.StandardSave(_weights(self.stage, state)),
             STATE_ITEM: ocp.args.StandardSave(_training_state(self.stage, state)),
             DATA_ITEM: ocp.args.JsonSave(position),
             CONFIG_ITEM: ocp.args.JsonSave(configuration.to_dict(self.config)),
@@ -139,19 +141,23 @@ class Checkpoints:
         self.wait(0 if self._settled else reasonable)
         self._settled = True
 
-    def restore(self, like: TrainState) -> TrainState:
+    def restore(self, like: TrainState, start: Params | None = None) -> TrainState:
         """Restore the newest checkpoint, with the shardings of the abstract state ``like``.
 
+        ``start`` are the parameters that checkpoints do not hold (``Stage.stored``), on the
+        devices.
+
         Raises:
-            UserError: there is no checkpoint, it belongs to another configuration, or it cannot be
-                read.
+            UserError: there is no checkpoint, it belongs to another configuration or to other start
+                weights, or it cannot be read.
         """
         items = {
-            WEIGHTS_ITEM: ocp.args.StandardRestore(inference_params(self.stage, like)),
+            WEIGHTS_ITEM: ocp.args.StandardRestore(_weights(self.stage, like)),
             STATE_ITEM: ocp.args.StandardRestore(_training_state(self.stage, like)),
         }
         read = self._read(items)
-        ema, frozen = tree.split(read[WEIGHTS_ITEM], self.stage.averaged)
+        whole = lora.complete(self.stage, read[WEIGHTS_ITEM], start or {})
+        ema, frozen = tree.split(whole, self.stage.averaged)
         rest = read[STATE_ITEM]
         return TrainState(
             params=tree.merge(rest["trained"], frozen),
@@ -161,8 +167,8 @@ class Checkpoints:
         )
 
     def restore_weights(self, like: TrainState) -> Params:
-        """Read only the inference weights of the newest checkpoint; see ``restore``."""
-        wanted = ocp.args.StandardRestore(inference_params(self.stage, like))
+        """Read only the weights in the newest checkpoint; see ``restore``."""
+        wanted = ocp.args.StandardRestore(_weights(self.stage, like))
         return self._read({WEIGHTS_ITEM: wanted})[WEIGHTS_ITEM]
 
     def publish(self, params: Params) -> None:
@@ -228,11 +234,28 @@ class Checkpoints:
                     f"{folder} is a checkpoint of another configuration ({runs.phrase(wrong)}): "
                     "choose another folder with --train.run, or restore the settings."
                 )
+            _require_base(self.config, folder)
             return self._writer.restore(folder, args=ocp.args.Composite(**items))
 
 
+def _weights(stage: Stage, state: TrainState) -> Params:
+    """Return the inference weights that a checkpoint holds."""
+    return lora.stored(stage, inference_params(stage, state))
+
+
+def _require_base(config: Config, folder: Path) -> None:
+    """Refuse to resume adapters on other start weights than those that they were trained on."""
+    facts = _read_json(folder / DATA_ITEM)
+    now = lora.reference(config)
+    if now and facts.get(lora.BASE_HASH) != now[lora.BASE_HASH]:
+        raise UserError(
+            f"{folder} holds adapters of other weights than those in {config.train.start}: restore "
+            "the weights that the run was started with, or choose another folder with --train.run."
+        )
+
+
 def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[Config, Params]:
-    """Read the experiment and only the inference weights, NumPy arrays, of one checkpoint's folder.
+    """Read the experiment and the inference weights, NumPy arrays, in one checkpoint's folder.
 
     ``like`` is called with the experiment and the stage's number for the shapes of the weights.
 
@@ -249,6 +272,11 @@ def read_weights(folder: Path, like: Callable[[Config, int], Params]) -> tuple[C
         config = configuration.from_dict(Config, _read_json(folder / CONFIG_ITEM))
         position = _read_json(folder / DATA_ITEM)
     return config, _read_arrays(folder, like(config, position["stage"]))
+
+
+def position(folder: Path) -> dict[str, Any]:
+    """Return the position in the data of the checkpoint in a folder, and its start weights."""
+    return _read_json(folder / DATA_ITEM)
 
 
 def _read_json(item: Path) -> dict[str, Any]:

@@ -58,6 +58,17 @@ CHIPS = (
         source="NVIDIA A100 data sheet (SXM, 80 GB); DGX A100: 8 × 200 Gb/s",
     ),
     Chip(
+        name="rtx4090",
+        device_kind=r"(NVIDIA )?(GeForce )?RTX 4090",
+        flops=165.2e12,
+        memory=24e9,
+        bandwidth=1008e9,
+        island=1,
+        link=32e9,
+        network=12.5e9,
+        source="NVIDIA Ada GPU architecture (GeForce RTX 4090); PCIe 4.0 × 16; 100 Gb/s Ethernet",
+    ),
+    Chip(
         name="h100",
         device_kind=r"(NVIDIA )?H100( 80GB HBM3| SXM5?)?",
         flops=989.4e12,

@@ -22,11 +22,13 @@ from pewm_jax.io import weights
 from pewm_jax.memory import feature_cache
 from pewm_jax.train import checkpoint_files, processes, runs
 from pewm_jax.types import Params
-from pewm_jax.worlds import rollouts
+from pewm_jax.worlds import lora, quantized, rollouts
 from pewm_jax.worlds.stages import Stage
 
 
-def load(path: str | Path, *, revision: str | None = None) -> tuple[Config, Params]:
+def load(
+    path: str | Path, *, revision: str | None = None, quantize: str = ""
+) -> tuple[Config, Params]:
     """Load a world model: the experiment, and its averaged (EMA) inference weights in NumPy arrays.
 
     Args:
@@ -35,13 +37,21 @@ def load(path: str | Path, *, revision: str | None = None) -> tuple[Config, Para
             checkpoint folder, such as ``runs/demo/checkpoints/stage1/200``; a folder of converted
             weights; the name of weights that ship with the library (``shipped.names()``); the name
             of a model on a hub, ``org/name`` or ``org/name@revision`` (``io.hub``), which is
-            downloaded to the cache first.
+            downloaded to the cache first. A run that trained adapters is loaded with the weights
+            that they adapt.
         revision: of a model on a hub: a branch, a tag or a commit; by default the newest.
+        quantize: ``int8`` or ``fp8`` keeps the kernels of the denoiser in 8 bits
+            (``worlds.quantized``).
 
     Raises:
         UserError: a file is missing or damaged, the weights do not fit the configuration, or the
             model cannot be downloaded.
     """
+    config, params = _load(path, revision)
+    return config, quantized.quantize(config.model, params, quantize)
+
+
+def _load(path: str | Path, revision: str | None) -> tuple[Config, Params]:
     if not isinstance(path, str | os.PathLike):
         raise UserError(
             f"load() got a path of type {type(path).__name__}: pass the folder of a run, the "
@@ -81,14 +91,29 @@ def _read(folder: Path) -> tuple[Config, Params]:
     # Imported here: Orbax takes a second to import, and finished runs do not need it.
     from pewm_jax.train import checkpoint  # noqa: PLC0415
 
-    return checkpoint.read_weights(folder, _shapes)
+    config, params = checkpoint.read_weights(folder, _stored_shapes)
+    if lora.ROOT in params:
+        # The folder is RUN/checkpoints/STAGE/STEP.
+        start = lora.find_base(folder.resolve().parents[2], checkpoint.position(folder))
+        base = rollouts.load_finished(start)[1]
+        params = lora.merge(base, params, config.train.lora, config.model.dtype)
+    return config, params
 
 
 def _shapes(config: Config, number: int) -> Params:
     """Return the shapes of the weights that a stage publishes."""
-    stage = next(stage for stage in runs.all_stages(config) if stage.number == number)
+    stage = _stage(config, number)
     shapes = jax.eval_shape(functools.partial(stage.init, config.model), jax.random.key(0))
     return stage.published(shapes)
+
+
+def _stored_shapes(config: Config, number: int) -> Params:
+    """Return the shapes of the parameters in a stage's checkpoints."""
+    return lora.stored(_stage(config, number), _shapes(config, number))
+
+
+def _stage(config: Config, number: int) -> Stage:
+    return next(stage for stage in runs.all_stages(config) if stage.number == number)
 
 
 def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]:
@@ -149,7 +174,7 @@ def read_weights(config: Config, stage: Stage, log: Callable[[str], None]) -> Pa
             continue
         later_only = _shapes(config, later.number).keys() - _shapes(config, stage.number).keys()
         extra = later_only & params.keys()
-        if extra:
+        if extra and not stage.stored:  # adapters leave them as they are
             log(
                 f"{config.train.start}: its {' and '.join(sorted(extra))} blocks are ignored; "
                 f"{later.title} initializes new ones"

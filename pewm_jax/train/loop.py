@@ -45,9 +45,11 @@ from pewm_jax.train.step import (
     initial_state,
     load_extra_weights,
     noise_key,
+    start_params,
 )
 from pewm_jax.train.watch import Preview, Samples, Watch
 from pewm_jax.types import Clip, Params
+from pewm_jax.worlds import lora
 from pewm_jax.worlds.stages import Stage
 
 _DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO}
@@ -81,6 +83,7 @@ def train(
     """
     config = runs.resumed(config, log if processes.is_primary() else _silent)
     planned = runs.planned(config)
+    lora.require_base(config)
     loading.require_weights(config)
     sinks.require_packages(config)  # fail before the data are prepared
     mesh = sharding.make_mesh(arranged=config.train.mesh)
@@ -149,7 +152,7 @@ class _Worker:
         return self.stage.settings(self.config)
 
     def train(self) -> Params:
-        """Train the stage unless it is done; return its inference weights."""
+        """Train the stage unless it is done; return its inference weights (``lora.stored``)."""
         config, stage, run, steps = self.config, self.stage, self.path, self.settings.steps
         with Checkpoints(run, config, stage, self.log) as self.checkpoints, self._writing():
             self.stop.at_once, self.stop.kept = True, self._saved_phrase
@@ -171,7 +174,7 @@ class _Worker:
                     config, stage, self.preview, self.view.log, self.stop.unless_requested
                 )
                 state = self.run(done)
-            params = inference_params(stage, state)
+            params = lora.stored(stage, inference_params(stage, state))
             self.checkpoints.publish(params)
             return params
 
@@ -275,13 +278,18 @@ class _Worker:
 
     def _make_state(self, done: int) -> TrainState:
         """Return the stage's initial state, or restore the checkpoint of step ``done``."""
-        if done:
-            self.view.log(f"{self.stage.title}: resuming after step {done}")
-            return self.checkpoints.restore(self.like)
+        config, stage = self.config, self.stage
         start, self.start = self.start, None
-        if start is None:
-            start = loading.read_weights(self.config, self.stage, self.log)
-        return initial_state(self.config, self.stage, self.mesh, start)
+        if stage.stored or (start is None and not done):
+            base = loading.read_weights(config, stage, self.log)
+            # Stages with adapters pass on what they trained, without the start weights.
+            start = base if start is None or base is None else lora.overlay(base, start)
+        if not done:
+            return initial_state(config, stage, self.mesh, start)
+        self.view.log(f"{stage.title}: resuming after step {done}")
+        if not stage.stored or start is None:
+            return self.checkpoints.restore(self.like)
+        return self.checkpoints.restore(self.like, start_params(config, stage, self.like, start))
 
     def _report(self, step: int, metrics: Metrics, sampled: TrainState | None = None) -> None:
         """Read, check, show and log a step's metrics; make samples if a state is passed."""
@@ -291,7 +299,9 @@ class _Worker:
         samples: dict[str, float] = {}
         if sampled is not None:
             with self._paused():
-                samples = self.samples.make(inference_params(self.stage, sampled), step)
+                params = inference_params(self.stage, sampled)
+                bound = lora.bind(self.config.model, self.config.train.lora, params)
+                samples = self.samples.make(bound, step)
         self.watch.write(step, values | samples, always=bool(samples))
 
     def _save(self, state: TrainState) -> None:

@@ -19,14 +19,16 @@ from optax.contrib import MuonDimensionNumbers, scale_by_muon
 
 from pewm_jax.config import Config, StageConfig
 from pewm_jax.io import tree
+from pewm_jax.nn.deferred import STACKED
 from pewm_jax.types import Params
 from pewm_jax.worlds.stages import ADVERSARY, FREEZE, TRAIN, Stage
 
 DECAYED = (
-    (r"(.*/)?kernel", True),
+    (r"(.*/)?kernel(/[ab])?", True),
     (r".*", False),
 )
-"""Leaves with weight decay: matrices, but not biases, scales, gates or embeddings."""
+"""Leaves with weight decay: matrices and their adapters, but not biases, scales, gates or
+embeddings."""
 
 
 def schedule(settings: StageConfig) -> optax.Schedule:
@@ -107,8 +109,6 @@ MATRICES = (
     (r".*", False),
 )
 """Leaves that Muon updates: matrices of hidden layers, but not the first and last layers."""
-STACKED = "blocks"
-"""Name of parameter subtrees whose first axis is the layer."""
 MUON_RMS = 0.2
 """Root mean square of Muon's updates, matched to Adam's typical value, so that both can use one
 learning rate (Liu et al. 2025, "Muon is scalable for LLM training", Eq. 4)."""

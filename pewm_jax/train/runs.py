@@ -24,11 +24,12 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax import config as configuration
-from pewm_jax import worlds
+from pewm_jax import shipped, worlds
 from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.io import atomic, weights
 from pewm_jax.train import processes
 from pewm_jax.types import Params
+from pewm_jax.worlds import lora, rollouts
 from pewm_jax.worlds.stages import Stage
 
 CONFIG = "config.json"
@@ -80,6 +81,11 @@ def all_stages(config: Config) -> tuple[Stage, ...]:
 
     Optional ones without steps are left out.
     """
+    return lora.adapt(config, _known(config))
+
+
+def _known(config: Config) -> tuple[Stage, ...]:
+    """Return the stages without adapters."""
     return tuple(
         stage
         for stage in worlds.stages(config.model)
@@ -166,12 +172,13 @@ def has_begun(run: Path) -> bool:
 
 
 def resumed(config: Config, log: Callable[[str], None] = print) -> Config:
-    """Return the settings with which a run is resumed.
+    """Return the settings with which a run is started or resumed.
 
-    A run begun by version 3 or earlier used fixed values for the settings ``KEPT``. If a preset now
+    With adapters, parameters that the start weights lack are added to ``train.lora.full``. A run
+    begun by version 3 or earlier used fixed values for the settings ``KEPT``. If a preset now
     has other values, the run's own are kept, and ``log`` gets a line.
     """
-    run = Path(config.train.run)
+    run, config = Path(config.train.run), _with_new_parameters(config, log)
     if not has_begun(run):
         return config
     there = configuration.load(run / CONFIG).train
@@ -182,6 +189,15 @@ def resumed(config: Config, log: Callable[[str], None] = print) -> Config:
     listed = ", ".join(f"train.{name} {value}" for name, value in kept.items())
     log(f"{run} keeps the settings that it was started with: {listed}")
     return dataclasses.replace(config, train=dataclasses.replace(config.train, **kept))
+
+
+def _with_new_parameters(config: Config, log: Callable[[str], None]) -> Config:
+    start = shipped.find(config.train.start)
+    if not (config.train.lora.rank and config.train.start and (start / WEIGHTS).is_file()):
+        return config
+    stages = [stage for stage in _known(config) if stage.settings(config).steps > 0]
+    params = rollouts.load_finished(start, lazily=True)[1]
+    return lora.with_new_parameters(config, stages, params, log)
 
 
 def prepare(config: Config) -> Path:
@@ -222,7 +238,8 @@ def publish(run: Path, stage: Stage, step: int, params: Params) -> Path:
     if processes.is_primary():
         for partial in run.glob(f"{WEIGHTS}.*partial"):
             atomic.remove(partial)  # left by a killed process
-        weights.save(path, params, _metadata(stage, step))
+        config = configuration.load(run / CONFIG)
+        weights.save(path, params, _metadata(stage, step) | lora.reference(config))
     return path
 
 

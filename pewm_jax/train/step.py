@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import re
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -25,6 +24,7 @@ from pewm_jax.io import tree
 from pewm_jax.nn import placement, target
 from pewm_jax.train import optimizer, sharding
 from pewm_jax.types import Array, Clip, Params
+from pewm_jax.worlds import lora
 from pewm_jax.worlds.stages import Stage
 
 Metrics = dict[str, Array]
@@ -36,8 +36,8 @@ class TrainState:
     """The state of one stage.
 
     Attributes:
-        params: all parameters of the stage: trained ones in float32, frozen ones in the model's
-            compute ``dtype``.
+        params: all parameters of the stage: trained ones, and adapters, in float32, frozen ones in
+            the model's compute ``dtype``.
         ema: exponential moving average of the trained parameters only, without those that serve
             training alone (``Stage.training_only``).
         opt_state: optimizer state; moments of the trained parameters only.
@@ -69,7 +69,12 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
             }
         )
     trained, frozen = tree.split(params, stage.trained)
-    params = tree.merge(trained, jax.tree.map(lambda x: x.astype(config.model.dtype), frozen))
+    kept, dtype = set(stage.stored), config.model.dtype
+    frozen = {
+        path: leaf if path in kept else leaf.astype(dtype)
+        for path, leaf in tree.flatten(frozen).items()
+    }
+    params = tree.merge(trained, tree.unflatten(frozen))
     return TrainState(
         params=params,
         ema=jax.tree.map(jnp.copy, stage.published(trained)),
@@ -94,7 +99,7 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Non
     wanted = {
         path: leaf
         for path, leaf in tree.flatten(like).items()
-        if path in leaves or not any(re.fullmatch(rule, path) for rule in lacking)
+        if path in leaves or not lora.matches((*lacking, lora.PATHS), path)
     }
     allowed = ", ".join(config.train.fresh) or "none"
     what = f"Initial weights of {stage.title} (may lack, by train.fresh: {allowed})"
@@ -116,6 +121,17 @@ def inference_params(stage: Stage, state: TrainState) -> Params:
     """Return the inference weights: the EMA of trained parameters, and the frozen ones."""
     frozen = tree.exclude(state.params, stage.trained)
     return tree.merge(state.ema, frozen)
+
+
+def start_params(config: Config, stage: Stage, like: TrainState, start: Params) -> Params:
+    """Return the start weights on the devices: the parameters that checkpoints do not hold.
+
+    ``like`` is the abstract state; see ``require_start`` for errors.
+    """
+    require_start(config, stage, start, like.params)
+    kept = set(stage.stored)
+    rest = {path: x for path, x in tree.flatten(start).items() if path not in kept}
+    return sharding.place(tree.unflatten(rest), like.params)
 
 
 def train_step(

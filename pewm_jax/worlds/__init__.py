@@ -312,7 +312,8 @@ def stages(model: Any) -> tuple[Stage, ...]:
 def sharding(model: Any) -> tuple[tuple[str, Any], ...]:
     """Return the rules from paths of parameters to the mesh axes of their last axes."""
     rules = model_of(model).sharding()
-    return tuple((pattern, PartitionSpec(*spec)) for pattern, spec in rules)
+    adapters = (r"lora/.*", PartitionSpec())
+    return (adapters, *((pattern, PartitionSpec(*spec)) for pattern, spec in rules))
 
 
 def split_heads(model: Any, stage: Stage) -> dict[str, int]:

@@ -23,6 +23,7 @@ from pewm_jax import shipped, worlds
 from pewm_jax.config import Config, World
 from pewm_jax.io import tree, weights
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
+from pewm_jax.worlds import lora
 
 
 def load_finished(
@@ -32,7 +33,8 @@ def load_finished(
 
     Args:
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``,
-            or the name of weights that come with the library.
+            or the name of weights that come with the library. Adapters (``worlds.lora``) are added
+            to the weights that they adapt.
         lazily: map the file into memory, so that unused weights are not read.
         config: the run's configuration, if it is read already.
 
@@ -41,9 +43,14 @@ def load_finished(
     """
     folder = shipped.find(path)
     config = configs.load(folder / "config.json") if config is None else config
-    params = (weights.lazy if lazily else weights.load)(folder / "weights.safetensors")
+    file = folder / "weights.safetensors"
+    params = (weights.lazy if lazily else weights.load)(file)
+    if lora.ROOT in params:
+        start = lora.find_base(folder, weights.metadata(file))
+        base = load_finished(start, lazily=lazily)[1]
+        params = lora.merge(base, params, config.train.lora, config.model.dtype)
     expected = _expected(config, params)
-    weights.check(params, expected, str(folder / "weights.safetensors"))
+    weights.check(params, expected, str(file))
     return config, params
 
 

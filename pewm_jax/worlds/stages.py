@@ -55,6 +55,8 @@ class Stage:
             before any stage is trained.
         rates: (pattern, factor) over the paths of trained parameters, the first match wins: the
             learning rate there is the stage's times the factor; elsewhere it is the stage's.
+        stored: paths of the parameters that checkpoints hold; empty for all. The others are those
+            of ``train.start``, and are not trained.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Stage:
     optional: bool = False
     require: Callable[[Any], None] | None = None
     rates: tuple[tuple[str, float], ...] = ()
+    stored: tuple[str, ...] = ()
 
     @property
     def title(self) -> str:
@@ -137,12 +140,12 @@ def in_world_form(model: Task, params: Params) -> Any:
 
 def with_dictionaries(model: Task, stage: Stage) -> Stage:
     """Return a stage whose parameters are nested dictionaries."""
-    return stage if _of_this_package(model) else _with_dictionaries(model, stage)
+    return stage if is_of_this_package(model) else _with_dictionaries(model, stage)
 
 
-def _of_this_package(model: Task) -> bool:
-    """Tell whether no ``init`` has to be traced to know the form."""
-    return type(model).__module__.startswith("pewm_jax.")
+def is_of_this_package(settings: Any) -> bool:
+    """Tell whether settings are of a class of this package, whose parameters have a known form."""
+    return type(settings).__module__.startswith("pewm_jax.")
 
 
 @functools.lru_cache(maxsize=256)
@@ -169,7 +172,7 @@ def _with_dictionaries(model: Task, stage: Stage) -> Stage:
 @functools.lru_cache(maxsize=64)
 def _forms(model: Task) -> tuple[Form, ...]:
     """Return the forms of all stages and of the world that are not nested dictionaries."""
-    if _of_this_package(model):
+    if is_of_this_package(model):
         return ()
     kind = type(model)
     makers = [*(stage.init for stage in kind.stages(model)), kind.init]

@@ -31,7 +31,7 @@ PAGES = sorted(
 )
 PLACEHOLDERS = {"FOLDER", "RUN", "DATA", "PRESET", "DST", "SRC", "FILE", "PIPELINE"}
 """Words of commands that stand for something of the reader's."""
-OPTIONAL = {"torch", "diffusers", "my_parts", "my_robot"}
+OPTIONAL = {"torch", "diffusers", "my_parts", "my_robot", "stable_baselines3"}
 """Modules in examples that need not be installed."""
 
 

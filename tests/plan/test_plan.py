@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets as configs
-from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
+from pewm_jax.config import ConfigError, Launch, LoRAConfig, MeshConfig, UserError
 from pewm_jax.data import abstract
 from pewm_jax.plan import measure, plan, suggest
 from pewm_jax.plan.measure import Compiled, MeshSizes
@@ -215,3 +215,19 @@ def test_links_beyond_an_island_are_shared_by_those_who_use_them():
     assert suggest.rate((0, 1, 2, 3), H200) == H200.link
     assert suggest.rate((0, 8, 16, 24), H200) == H200.network
     assert suggest.rate(tuple(range(16)), H200) == min(H200.link, 8 * H200.network)
+
+
+def test_a_plan_counts_adapters_and_their_optimizer_state():
+    config = configs.load("tiny")
+    lora = LoRAConfig(rank=3)
+    train = dataclasses.replace(config.train, lora=lora)
+    (stage, _), plain = runs.all_stages(dataclasses.replace(config, train=train)), config
+    adapted = dataclasses.replace(config, train=train)
+    trained = 2 * 4 * 3 * (32 + 32)  # layers × projections × rank × (in + out)
+    assert counts(adapted, stage)["trained"].count == trained
+    memory = suggest.memory_of(adapted, stage, MeshSizes())
+    assert memory.trained == memory.average == memory.gradients == 4 * trained
+    assert memory.moments == pytest.approx(8 * trained, rel=0.01)
+    whole = suggest.memory_of(plain, runs.all_stages(plain)[0], MeshSizes())
+    assert memory.frozen == whole.trained + whole.frozen
+    assert f"rank 3: {trained:,} of" in plan.adapters(adapted, stage)
