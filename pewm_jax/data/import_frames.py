@@ -208,7 +208,7 @@ class RecordMaker:
             return np.array(config.intrinsics) + np.array([0, 0, half, half])
         if raw.intrinsics_4 is not None:
             return np.asarray(raw.intrinsics_4, np.float64)
-        if raw.depth_scale is None:
+        if raw.depth_scale is None or raw.pose_T44 is None:  # no geometry is computed
             return _assumed(raw.size)
         raise UserError(
             f"{config.src}: the files do not have the camera's intrinsics; give --intrinsics fx fy "
