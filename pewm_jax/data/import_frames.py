@@ -426,8 +426,11 @@ def _actions(
     Recorded actions of frames that are left out are joined as ``data.clips.join_actions`` does.
     """
     planar = planar_actions(pose) if raw.pose_T44 is not None else None
-    if raw.actions_TA is None or (planar is not None and raw.actions_TA.shape[1] == PLANAR):
+    if raw.actions_TA is None:
         return planar
+    if planar is not None and raw.actions_TA.shape[1] == PLANAR:
+        derived = len(numbers) < part.entry.frames or not _agree(raw.actions_TA, pose)
+        return planar if derived else raw.actions_TA.astype(np.float32)
     if len(set(np.diff(numbers))) > 1:
         raise UserError(
             f"{part.name}: frames in the middle cannot be left out, because actions of width "
@@ -464,6 +467,12 @@ def world_from_recording(up: str) -> np.ndarray:
     return rotation
 
 
+def _agree(actions_TA: np.ndarray, pose_T44: np.ndarray) -> bool:
+    """Tell whether planar actions lead from each pose to the next."""
+    metres, radians = checks.action_errors(pose_T44, actions_TA)
+    return bool(((metres < checks.ACTION_M) & (radians < checks.ACTION_RAD)).all())
+
+
 def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     """Return the (T − 1, 3) actions of a camera that only moves and turns on the ground.
 
@@ -473,9 +482,4 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     if len(world_from_camera) < 2:
         return None
     actions = np.asarray(actions_between(np.asarray(world_from_camera, np.float32)))
-    metres, radians = checks.action_errors(world_from_camera, actions)
-    return (
-        actions
-        if bool(((metres < checks.ACTION_M) & (radians < checks.ACTION_RAD)).all())
-        else None
-    )
+    return actions if _agree(actions, world_from_camera) else None
