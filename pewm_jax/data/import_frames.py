@@ -159,9 +159,7 @@ class RecordMaker:
         frames = list(self._encoded(seen, numbers, meter))
         if frames:
             self.made = seen.fit.target
-            record = self._record(part, seen, frames)
-            frames.clear()  # the record has a copy
-            yield record
+            yield self._record(part, seen, frames)
 
     def _open(self, part: Part) -> _Opened:
         if self._last is None or self._last[0] is not part.entry:  # parts of one are consecutive
@@ -261,7 +259,7 @@ class RecordMaker:
         return _Encoded(number, *images, per_metre, thumb, recorded)
 
     def _record(self, part: Part, seen: _Opened, frames: list[_Encoded]) -> bytes:
-        """Check an episode and return its record."""
+        """Check an episode and return its record; ``frames`` is emptied."""
         raw, config = seen.raw, self.config
         numbers = [one.number for one in frames]
         labels = [raw.labels(k) for k in numbers]
@@ -300,7 +298,9 @@ class RecordMaker:
         if voxels is not None:
             streams["voxels"] = [encode(grid) for grid in voxels.classes_TXYZ]
             about["voxels"] = header_of(voxels)
+        frames.clear()  # the record is a copy: it is not in memory twice when it is written
         record = pack_encoded(header, small, streams, about)
+        streams.clear()
         if voxels is not None:
             found = checks.check_episode(read_episode(record), str(config.src))
             self._refuse(found, labels)
