@@ -42,8 +42,12 @@ class Files:
 
     def path(self, number: int) -> Path:
         """Return the path of a frame's file, also if it is missing."""
+        if number in self.names:
+            return self.folder / self.names[number]
         end = self.end if isinstance(self.end, str) else self.end[0]
-        return self.folder / self.names.get(number, f"{self.start}{number}{end}")
+        like = next(iter(self.names.values()), "").removeprefix(self.start)
+        zeros = like.index(".") if like.startswith("0") and "." in like else 1
+        return self.folder / f"{self.start}{number:0{zeros}d}{end}"
 
 
 @dataclasses.dataclass(frozen=True)
