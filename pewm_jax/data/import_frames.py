@@ -278,7 +278,7 @@ class RecordMaker:
         header = new_header(
             part.name,
             part.scene,
-            (len(frames), *seen.fit.target[::-1]),
+            (len(frames), seen.fit.target[1], seen.fit.target[0]),
             self._info(part, raw, numbers),
         )
         small = {
@@ -344,7 +344,7 @@ def _lost(pose_T44: np.ndarray) -> np.ndarray:
 
     Those with some are wrong rather than lost: the checks refuse them.
     """
-    return ~np.isfinite(pose_T44[:, :3]).any((1, 2))
+    return np.logical_not(np.isfinite(pose_T44[:, :3]).any((1, 2)))
 
 
 def _checked(picture: Picture, seen: _Opened, number: int) -> Picture:

@@ -135,7 +135,7 @@ def matched(folder: Path, end: str, times: np.ndarray) -> list[Path | None]:
     files = by_time(folder, end)
     there = np.array(sorted(files))
     index, fits = nearest(times, there)
-    return [files[there[i]] if fit else None for i, fit in zip(index, fits, strict=True)]
+    return [files[float(there[i])] if fit else None for i, fit in zip(index, fits, strict=True)]
 
 
 def nearest(times: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
