@@ -173,13 +173,12 @@ class ImportFiles:
         """Yield a line about what was added: images of a width and height, and their motion."""
         mine = [one for one in self.done.values() if one is not None]
         episodes, frames = sum(m.shard.records for m in mine), sum(m.frames for m in mine)
-        grids = ", voxels" if all(one.voxels for one in mine) else ""
         depth = "" if all(one.depth for one in mine) else ", no depth"
         parts = "" if episodes == 1 else f"{episodes} episodes, "
         pixels = f"{size[0]}×{size[1]} pixels" if size[0] else "images"
         yield (
             f"{self.folder}: added {self.config.called}, {parts}{frames} frames of {pixels}, "
-            f"{moves}{grids}{depth}."
+            f"{moves}{depth}."
         )
 
     def _finished(self, path: Path, parts: list[Part]) -> _Listed | None:

@@ -129,7 +129,7 @@ class RecordMaker:
         bad: counts frames that are left out.
         check: receives frames for ``--check``, or None.
         made: width and height of the images that were made.
-        moves: what the episodes have of the camera's motion, in words.
+        moves: what the episodes have of the camera's motion, and their grids, in words.
         notes: what the format tells the user, in order.
     """
 
@@ -275,6 +275,8 @@ class RecordMaker:
         actions = _actions(raw, part, numbers, pose)
         if actions is not None:
             self.moves = "planar actions" if actions.shape[1] == PLANAR else "recorded actions"
+        if voxels is not None:
+            self.moves = f"{self.moves.split(', voxels')[0]}, voxels of {voxels.grid.side}³ cells"
         header = new_header(
             part.name,
             part.scene,
