@@ -72,6 +72,7 @@ def write_shard(path: Path, records: Iterable[bytes]) -> Shard:
             for record in records:
                 with _refused_writes(path):
                     writer.write(record)
+                del record  # before the next one is made
         finally:
             with _refused_writes(path):
                 writer.close()

@@ -34,7 +34,8 @@ class Fit:
     @property
     def turned(self) -> tuple[int, int]:
         """Width and height after turning."""
-        return self.source if self.turns % 2 == 0 else self.source[::-1]
+        width, height = self.source
+        return (width, height) if self.turns % 2 == 0 else (height, width)
 
     @property
     def target(self) -> tuple[int, int]:

@@ -15,11 +15,11 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from pewm_jax.config import UserError
 from pewm_jax.data import dataset
-from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.episodes import Episode, read_episode
 from pewm_jax.data.formats.options import ImportConfig
 from pewm_jax.data.formats.reader import Entry
 from pewm_jax.data.voxels import VoxelGrid, require_alike
@@ -127,18 +127,20 @@ class ImportFiles:
 
     def write(self, path: Path, records: Iterator[bytes]) -> None:
         """Write a file of one record or more; none if there are no records."""
-        first = list(itertools.islice(records, 1))
+        box, found = list(itertools.islice(records, 1)), []
         self.done[path] = None
-        if not first:
+        if not box:
             path.unlink(missing_ok=True)
             return
 
         def every() -> Iterator[bytes]:
-            yield self._alike(first.pop())
-            for record in records:
-                yield self._alike(record)
+            while box:
+                found.append(self._contents(box[0]))
+                yield box.pop()  # not kept here, as it is large
+                box.extend(itertools.islice(records, 1))
 
-        self.done[path] = _inspect(path, dataset.write_shard(path, every()))
+        shard = dataset.write_shard(path, every())
+        self.done[path] = _listed(shard, found)
 
     def publish(self) -> None:
         """Write ``dataset.json``, and remove files of an earlier import of the same name.
@@ -171,13 +173,12 @@ class ImportFiles:
         """Yield a line about what was added: images of a width and height, and their motion."""
         mine = [one for one in self.done.values() if one is not None]
         episodes, frames = sum(m.shard.records for m in mine), sum(m.frames for m in mine)
-        grids = ", voxels" if all(one.voxels for one in mine) else ""
         depth = "" if all(one.depth for one in mine) else ", no depth"
         parts = "" if episodes == 1 else f"{episodes} episodes, "
         pixels = f"{size[0]}×{size[1]} pixels" if size[0] else "images"
         yield (
             f"{self.folder}: added {self.config.called}, {parts}{frames} frames of {pixels}, "
-            f"{moves}{grids}{depth}."
+            f"{moves}{depth}."
         )
 
     def _finished(self, path: Path, parts: list[Part]) -> _Listed | None:
@@ -259,24 +260,36 @@ class ImportFiles:
                 whole.append(_inspect(path, dataset.describe_shard(path)))
         return whole
 
-    def _alike(self, record: bytes) -> bytes:
-        """Return a record; UserError if its voxels are not like those of the split."""
-        grid = read_episode(record).voxel_grid
-        there = next((one for one in self.others if one.voxels), None)
+    def _contents(self, record: bytes) -> _Contents:
+        """Return what a record contains; UserError if its voxels are not like the split's."""
+        episode = read_episode(record)
+        grid, there = episode.voxel_grid, next((one for one in self.others if one.voxels), None)
         if grid is not None and there is not None:
             other = self.folder / there.shard.file
             known = read_episode(dataset.read_record(other, 0), str(other)).voxel_grid
             assert isinstance(known, VoxelGrid)
             require_alike(known, grid, str(self.config.src / "voxels"))
-        return record
+        return _contents(episode)
+
+
+_Contents: TypeAlias = tuple[int, bool, bool, bool]
+"""Frames of an episode, and whether it has actions, voxels and depth."""
+
+
+def _contents(episode: Episode) -> _Contents:
+    actions, voxels = episode.actions is not None, episode.voxel_grid is not None
+    return episode.length, actions, voxels, episode.has_depth
 
 
 def _inspect(path: Path, shard: dataset.Shard) -> _Listed:
     """Open a file and return what it contains."""
-    frames, fields = 0, []
-    for index in range(shard.records):
-        episode = read_episode(dataset.read_record(path, index), str(path))
-        frames += episode.length
-        found = episode.actions is not None, episode.voxel_grid is not None, episode.has_depth
-        fields.append(found)
-    return _Listed(shard, frames, *(all(each) for each in zip(*fields, strict=True)))
+    every = range(shard.records)
+    return _listed(
+        shard, [_contents(read_episode(dataset.read_record(path, k), str(path))) for k in every]
+    )
+
+
+def _listed(shard: dataset.Shard, contents: Sequence[_Contents]) -> _Listed:
+    """Return a file with the sum of its frames, and what all of its episodes have."""
+    frames, *fields = zip(*contents, strict=True)
+    return _Listed(shard, sum(frames), *(all(each) for each in fields))

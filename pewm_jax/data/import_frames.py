@@ -129,7 +129,7 @@ class RecordMaker:
         bad: counts frames that are left out.
         check: receives frames for ``--check``, or None.
         made: width and height of the images that were made.
-        moves: what the episodes have of the camera's motion, in words.
+        moves: what the episodes have of the camera's motion, and their grids, in words.
         notes: what the format tells the user, in order.
     """
 
@@ -159,9 +159,7 @@ class RecordMaker:
         frames = list(self._encoded(seen, numbers, meter))
         if frames:
             self.made = seen.fit.target
-            record = self._record(part, seen, frames)
-            frames.clear()  # the record has a copy
-            yield record
+            yield self._record(part, seen, frames)
 
     def _open(self, part: Part) -> _Opened:
         if self._last is None or self._last[0] is not part.entry:  # parts of one are consecutive
@@ -208,7 +206,7 @@ class RecordMaker:
             return np.array(config.intrinsics) + np.array([0, 0, half, half])
         if raw.intrinsics_4 is not None:
             return np.asarray(raw.intrinsics_4, np.float64)
-        if raw.depth_scale is None:
+        if raw.depth_scale is None or raw.pose_T44 is None:  # no geometry is computed
             return _assumed(raw.size)
         raise UserError(
             f"{config.src}: the files do not have the camera's intrinsics; give --intrinsics fx fy "
@@ -261,7 +259,7 @@ class RecordMaker:
         return _Encoded(number, *images, per_metre, thumb, recorded)
 
     def _record(self, part: Part, seen: _Opened, frames: list[_Encoded]) -> bytes:
-        """Check an episode and return its record."""
+        """Check an episode and return its record; ``frames`` is emptied."""
         raw, config = seen.raw, self.config
         numbers = [one.number for one in frames]
         labels = [raw.labels(k) for k in numbers]
@@ -277,10 +275,12 @@ class RecordMaker:
         actions = _actions(raw, part, numbers, pose)
         if actions is not None:
             self.moves = "planar actions" if actions.shape[1] == PLANAR else "recorded actions"
+        if voxels is not None:
+            self.moves = f"{self.moves.split(', voxels')[0]}, voxels of {voxels.grid.side}³ cells"
         header = new_header(
             part.name,
             part.scene,
-            (len(frames), *seen.fit.target[::-1]),
+            (len(frames), seen.fit.target[1], seen.fit.target[0]),
             self._info(part, raw, numbers),
         )
         small = {
@@ -300,7 +300,9 @@ class RecordMaker:
         if voxels is not None:
             streams["voxels"] = [encode(grid) for grid in voxels.classes_TXYZ]
             about["voxels"] = header_of(voxels)
+        frames.clear()  # the record is a copy: it is not in memory twice when it is written
         record = pack_encoded(header, small, streams, about)
+        streams.clear()
         if voxels is not None:
             found = checks.check_episode(read_episode(record), str(config.src))
             self._refuse(found, labels)
@@ -344,7 +346,7 @@ def _lost(pose_T44: np.ndarray) -> np.ndarray:
 
     Those with some are wrong rather than lost: the checks refuse them.
     """
-    return ~np.isfinite(pose_T44[:, :3]).any((1, 2))
+    return np.logical_not(np.isfinite(pose_T44[:, :3]).any((1, 2)))
 
 
 def _checked(picture: Picture, seen: _Opened, number: int) -> Picture:
@@ -426,8 +428,11 @@ def _actions(
     Recorded actions of frames that are left out are joined as ``data.clips.join_actions`` does.
     """
     planar = planar_actions(pose) if raw.pose_T44 is not None else None
-    if raw.actions_TA is None or (planar is not None and raw.actions_TA.shape[1] == PLANAR):
+    if raw.actions_TA is None:
         return planar
+    if planar is not None and raw.actions_TA.shape[1] == PLANAR:
+        derived = len(numbers) < part.entry.frames or not _agree(raw.actions_TA, pose)
+        return planar if derived else raw.actions_TA.astype(np.float32)
     if len(set(np.diff(numbers))) > 1:
         raise UserError(
             f"{part.name}: frames in the middle cannot be left out, because actions of width "
@@ -464,6 +469,12 @@ def world_from_recording(up: str) -> np.ndarray:
     return rotation
 
 
+def _agree(actions_TA: np.ndarray, pose_T44: np.ndarray) -> bool:
+    """Tell whether planar actions lead from each pose to the next."""
+    metres, radians = checks.action_errors(pose_T44, actions_TA)
+    return bool(((metres < checks.ACTION_M) & (radians < checks.ACTION_RAD)).all())
+
+
 def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     """Return the (T − 1, 3) actions of a camera that only moves and turns on the ground.
 
@@ -473,9 +484,4 @@ def planar_actions(world_from_camera: np.ndarray) -> np.ndarray | None:
     if len(world_from_camera) < 2:
         return None
     actions = np.asarray(actions_between(np.asarray(world_from_camera, np.float32)))
-    metres, radians = checks.action_errors(world_from_camera, actions)
-    return (
-        actions
-        if bool(((metres < checks.ACTION_M) & (radians < checks.ACTION_RAD)).all())
-        else None
-    )
+    return actions if _agree(actions, world_from_camera) else None

@@ -33,6 +33,8 @@ def import_recording(config: ImportConfig, log: Callable[[str], None] = print) -
     Raises:
         UserError: files are missing or do not match, or an episode fails validation.
     """
+    if not config.src.is_dir():
+        raise UserError(f"{config.src} is not a folder; give the folder of a recording.")
     if config.format == formats.AUTO:
         found, why = formats.recognise(config.src)
         log(f"{config.src}: recognised as {found.NAME}, because there is {why}.")

@@ -251,8 +251,8 @@ def _check_first(config: Config, source: EpisodeSource, bad: BadRecords) -> Epis
             bad.add(_name(source, record), str(error))
             continue
         _check_size(config, first)
-        _check_actions(config, first)
         require_recorded(config.model, source, first)
+        _check_actions(config, first)
         require_same_cells(config.model, first)
         choose(config, first.length, np.random.default_rng(0), f"episode {first.name}")
         return first
@@ -333,7 +333,8 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
     listed = source.manifest.settings.get("depth", {None: True})
     if not (spec.depth or spec.poses):
         return
-    first = first or source[0]
+    first = source[0] if first is None else first
+    assert first is not None
     if spec.depth and not (first.has_depth and all(listed.values())):
         raise ConfigError(
             f"{source.path} has episodes without depth, and {name} needs it, for its memory or "

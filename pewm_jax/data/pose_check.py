@@ -69,11 +69,11 @@ class PoseCheck:
 
     def __init__(self) -> None:
         self._kept: list[_Kept] = []
-        self._room, self._lock = KEPT, threading.Lock()
+        self._room, self._lock, self._asked = KEPT, threading.Lock(), False
 
     def choose(self, numbers: Sequence[int]) -> set[int]:
         """Return which frames of the next episode to pass to ``add``; only the first ones count."""
-        count, self._room = min(self._room, len(numbers)), 0
+        count, self._room, self._asked = min(self._room, len(numbers)), 0, True
         return {numbers[round(k)] for k in np.linspace(0, len(numbers) - 1, count)}
 
     def add(
@@ -104,6 +104,9 @@ class PoseCheck:
 
     def report(self, path: Path, log: Callable[[str], None]) -> None:
         """Draw pairs of distant frames to a PNG file, and print the error and what fits better."""
+        if not self._asked:
+            log("check: no frame was read, so poses cannot be checked; repeat with --overwrite.")
+            return
         if not self._kept:
             log("check: there is no depth to reproject, so poses cannot be checked.")
             return

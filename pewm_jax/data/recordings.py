@@ -219,6 +219,8 @@ def _stamped_lines(path: Path) -> list[tuple[int, float, list[str]]]:
 
 def _from_quaternion(path: Path, number: int, fields: list[str]) -> np.ndarray:
     values = _floats(path, number, fields, 7)
+    if not np.isfinite(values).any():  # a lost pose
+        return np.full((4, 4), np.nan)
     norm = float(np.linalg.norm(values[3:]))
     if not abs(norm - 1) < 1e-2:
         raise UserError(f"{path}, line {number}: the quaternion has length {norm:.3g}, not 1.")

@@ -389,6 +389,16 @@ def test_tum_frames_without_a_partner_are_left_out(tmp_path, walk):
     assert names == [f"{k:05d}" for k in range(24) if k != 5]
 
 
+def test_a_lost_pose_of_tum_is_left_out(tmp_path, walk):
+    folder, lines = record(tmp_path / "rec", walk, style="tum"), []
+    text = (folder / "groundtruth.txt").read_text().splitlines()
+    text[6] = " ".join([text[6].split()[0], *["-inf"] * 7])
+    (folder / "groundtruth.txt").write_text("\n".join(text))
+    import_recording(config(folder, tmp_path / "out"), lines.append)
+    assert imported(tmp_path / "out").info["left_out"] == [5]
+    assert "1 frame left out because the pose is lost" in lines[0]
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

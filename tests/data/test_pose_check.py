@@ -64,7 +64,10 @@ def test_a_wrong_convention_is_named_and_its_option_mends_it(tmp_path, name):
 def test_without_depth_or_overlap_it_says_so(tmp_path):
     check, lines = PoseCheck(), []
     check.report(tmp_path / "x.png", lines.append)
-    assert "no depth to reproject" in lines[0]
+    assert "no frame was read" in lines[0]
+    check.choose(range(3))
+    check.report(tmp_path / "x.png", lines.append)
+    assert "no depth to reproject" in lines[1]
     walk = layouts.hand_held(2)
     apart = np.stack([np.eye(4), np.eye(4)])
     apart[1, 0, 3] = 1e4

@@ -43,6 +43,7 @@ class Habitat(Format):
     NAME: ClassVar[str] = "habitat"
     LAYOUT: ClassVar[str] = "*.glb and episodes in *.json.gz"
     DEPTH_SCALE: ClassVar[float | None] = None
+    LAST: ClassVar[int] = 2
     USES: ClassVar[tuple[str, ...]] = (
         *("episodes", "fov", "camera_height"),
         *("frames", "step", "turn_deg"),

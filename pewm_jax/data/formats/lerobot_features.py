@@ -69,19 +69,11 @@ class Features:
         return found[0]
 
     def depth_of(self, camera: str) -> str | None:
-        """Return the feature of the depth images of a camera: of the most similar name."""
-
-        def shared(key: str) -> int:
-            same = (a == b for a, b in zip(key, camera, strict=False))
-            return next((k for k, equal in enumerate(same) if not equal), len(camera))
-
-        known = self._images(depth=True)
-        stem = camera.rpartition(".")[2]
-        named = [key for key in known if key.rpartition(".")[2].startswith(stem)]
-        others = [key for key in self._images(depth=False) if key != camera]
-        if not named and others:  # the depth may belong to another camera
-            return None
-        return max(named or known, key=shared, default=None)
+        """Return the feature of a camera's depth: of the same name, or the only one of all."""
+        known, only = self._images(depth=True), len(self._images(depth=False)) == 1
+        name = camera.rpartition(".")[2]
+        named = [key for key in known if name in key.rpartition(".")[2]]
+        return next(iter(named or (known if only else [])), None)
 
     def pose(self, wanted: str | None) -> str | None:
         """Return the feature of the camera's pose, None if no name tells one."""

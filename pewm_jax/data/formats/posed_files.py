@@ -42,8 +42,12 @@ class Files:
 
     def path(self, number: int) -> Path:
         """Return the path of a frame's file, also if it is missing."""
+        if number in self.names:
+            return self.folder / self.names[number]
         end = self.end if isinstance(self.end, str) else self.end[0]
-        return self.folder / self.names.get(number, f"{self.start}{number}{end}")
+        like = next(iter(self.names.values()), "").removeprefix(self.start)
+        zeros = like.index(".") if like.startswith("0") and "." in like else 1
+        return self.folder / f"{self.start}{number:0{zeros}d}{end}"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,7 +135,7 @@ def matched(folder: Path, end: str, times: np.ndarray) -> list[Path | None]:
     files = by_time(folder, end)
     there = np.array(sorted(files))
     index, fits = nearest(times, there)
-    return [files[there[i]] if fit else None for i, fit in zip(index, fits, strict=True)]
+    return [files[float(there[i])] if fit else None for i, fit in zip(index, fits, strict=True)]
 
 
 def nearest(times: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

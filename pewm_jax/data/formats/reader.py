@@ -146,7 +146,7 @@ class FolderFormat(Format):
         for folder in itertools.islice(self._candidates(src), 100):
             why = self.found(folder)
             if why:
-                return why if folder == src else f"{folder.name}/ has {why}"
+                return why if folder == src else f"{why} in {folder.relative_to(src)}/"
         return ""
 
     def entries(self, options: ImportConfig) -> list[Entry]:

@@ -142,13 +142,8 @@ def _odometry(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of the file by name; old versions have no heading and 7 columns."""
     with path.open(encoding="utf-8", errors="replace") as file:
         names = [word.strip().lower() for word in file.readline().split(",")]
-    if names[0][:1].isalpha():
-        table = read_table(path, len(names), ",")
-    else:
+    if not names[0][:1].isalpha():
         names = list(COLUMNS) if len(names) == len(COLUMNS) else ["timestamp", "frame", *COLUMNS]
-        table = read_table(path, len(names), ",")
     if not set(COLUMNS) <= set(names):
-        raise UserError(
-            f"{path} has the columns {', '.join(names)}; it needs {', '.join(COLUMNS)}."
-        )
-    return dict(zip(names, table.T, strict=True))
+        raise UserError(f"{path} lacks one of the columns {', '.join(COLUMNS)}.")
+    return dict(zip(names, read_table(path, len(names), ",").T, strict=True))
