@@ -361,8 +361,13 @@ def _write_meta(
     place.mkdir(parents=True)
     parquet.write_table(arrow.Table.from_pylist(rows), place / "file-000.parquet")
     names = arrow.table({"task_index": list(tasks.values()), "task": list(tasks)})
-    pandas = {
-        "index_columns": ["task"], "columns": [], "column_indexes": [],
+    kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    columns = [
+        dict(zip(("name", "field_name", "pandas_type", "numpy_type", "metadata"), row, strict=True))
+        for row in ((name, name, kind, dtype, None) for name, kind, dtype in kinds)
+    ]
+    pandas = {  # the package reads the texts as an index of pandas
+        "index_columns": ["task"], "columns": columns, "column_indexes": [],
         "creator": {"library": "pyarrow", "version": arrow.__version__}, "pandas_version": "2.0.0",
     }  # fmt: skip
     names = names.replace_schema_metadata({"pandas": json.dumps(pandas)})
