@@ -226,7 +226,8 @@ class _Videos:
         """End an episode of a number of frames; return its place in the videos."""
         assert self._video is not None
         last = self._video.frames
-        place = {f"videos/{self.key}/{name}": value for name, value in _number(self._index).items()}
+        at: dict[str, float] = {**_number(self._index)}
+        place = {f"videos/{self.key}/{name}": value for name, value in at.items()}
         place[f"videos/{self.key}/from_timestamp"] = (last - length) / self.fps
         place[f"videos/{self.key}/to_timestamp"] = last / self.fps
         if self._video.bytes >= VIDEO_MB * 1e6 * FULL:
