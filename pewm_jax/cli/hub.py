@@ -61,12 +61,11 @@ def pull(settings: PullSettings) -> None:
         from pewm_jax.convert import pipeline
 
         with pipeline.new_folder(settings.out) as partial:
-            for name in hub.WORLD:
-                if (folder / name).is_file():
-                    shutil.copyfile(folder / name, partial / name)
-    from pewm_jax.io import weights
+            _copy(folder, partial)
+    else:
+        from pewm_jax.io import weights
 
-    weights.verify(folder / "weights.safetensors")
+        weights.verify(folder / "weights.safetensors")
     print(f"{hub.title(folder)}: {settings.out or folder}")
 
 
@@ -98,10 +97,30 @@ def _is_path(name: str) -> bool:
 
 
 def _write(settings: PushSettings, dst: Path, name: str = "") -> None:
-    """Write the files to push into a new folder."""
-    from pewm_jax.convert import inference
+    """Write the files to push into a new folder.
+
+    A world gets a card; of a policy, which has none, the files are copied.
+    """
+    from pewm_jax import config as configuration
+    from pewm_jax.convert import inference, pipeline
 
     run = shipped.find(settings.run)
-    inference.export(run, dst, settings.dtype, name=name, log=lambda _: None)
-    if settings.dtype is None and (run / inference.CARD).is_file():
-        shutil.copyfile(run / inference.CARD, dst / inference.CARD)
+    if not run.is_dir():
+        raise UserError(f"{settings.run} does not exist; give the folder of a run.")
+    if configuration.load(run / "config.json").model.EXPORTED:
+        inference.export(run, dst, settings.dtype, name=name, log=lambda _: None)
+        if settings.dtype is None and (run / inference.CARD).is_file():
+            shutil.copyfile(run / inference.CARD, dst / inference.CARD)
+    else:
+        with pipeline.new_folder(dst) as partial:
+            _copy(run, partial)
+
+
+def _copy(src: Path, dst: Path) -> None:
+    """Copy the files of a model from a folder to another one, and verify its weights."""
+    from pewm_jax.io import weights
+
+    weights.verify(src / "weights.safetensors")
+    for name in hub.WORLD:
+        if (src / name).is_file():
+            shutil.copyfile(src / name, dst / name)

@@ -73,7 +73,7 @@ COMMANDS = {
     "data export": Command(
         "write episodes for LeRobot, RLDS or Rerun, as points or as videos",
         "pewm_jax.data.exports.options:ExportConfig",
-        "pewm_jax.data.exports.options:export",
+        "pewm_jax.data.exports.command:export",
     ),
     "show": Command(
         "imagine along an episode, and write it for Rerun, as points or a video",

@@ -143,7 +143,9 @@ def _imagined(settings: Settings, opened: Any) -> Imagined:
     after = np.arange(first + 1, first + 1 + count)
     observed, true = episode.frames(range(settings.context)), episode.frames(after)
     planar = episode.actions is not None and episode.actions.shape[1] == PLANAR
-    control: Any = episode.actions[first : first + count] if planar else true.camera
+    control: Any = true.camera
+    if planar and episode.actions is not None:
+        control = episode.actions[first : first + count]
     print(f"imagining {count} frames …", flush=True)
     state = worlds.start(config, params, observed)
     state, frames = rollout(config, params, state, control, jax.random.key(settings.seed))

@@ -35,7 +35,7 @@ FLOATS = ("float32", "bfloat16", "float16")
 STORED = (*FLOATS, "float64")
 """Supported dtypes of stored weights; a table computed by a network can be float64."""
 _MEGABYTE = 1 << 20
-_CAST = 16 * _MEGABYTE
+_CAST = _MEGABYTE
 """Bytes of a tensor that are converted to another dtype at once."""
 Specs = dict[str, jax.ShapeDtypeStruct]
 """Shape and dtype of every leaf, by path."""

@@ -8,7 +8,9 @@ padding are zeros.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+import importlib
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,11 +54,37 @@ def encode(
             f"text of {width} channels; they are not from the same pipeline."
         )
     sources.open_folder(encoder)  # raises an error for an incomplete or damaged folder
-    return _encode(encoder, tokenizer, prompts, length, masked=masked)
+    with tempfile.TemporaryDirectory(prefix="pewm-text-") as scratch:
+        where = _placement(int(values.get("num_layers", 0)), scratch)
+        return _encode(encoder, tokenizer, prompts, length, where, masked=masked)
+
+
+def _placement(layers: int, scratch: str) -> dict[str, Any]:
+    """Return the arguments of ``from_pretrained`` that leave the layers of a T5 encoder on disk.
+
+    Each is read when it is computed, so that one layer is in memory. Without accelerate, the
+    encoder is loaded as a whole.
+    """
+    try:
+        utils: Any = importlib.import_module("transformers").utils
+    except ImportError:  # refused where it is used
+        return {}
+    if not layers or not utils.is_accelerate_available():
+        return {}
+    ends = ("shared", "encoder.embed_tokens", "encoder.final_layer_norm")
+    places = dict.fromkeys(ends, "cpu")
+    places |= {f"encoder.block.{layer}": "disk" for layer in range(layers)}
+    return {"device_map": places, "offload_folder": scratch}
 
 
 def _encode(
-    encoder: Path, tokenizer: Path, prompts: Sequence[str], length: int, *, masked: bool
+    encoder: Path,
+    tokenizer: Path,
+    prompts: Sequence[str],
+    length: int,
+    where: Mapping[str, Any],
+    *,
+    masked: bool,
 ) -> dict[str, np.ndarray]:
     try:
         import torch  # noqa: PLC0415 - an extra
@@ -70,7 +98,7 @@ def _encode(
         tokenize = transformers.AutoTokenizer.from_pretrained(tokenizer, local_files_only=True)
     with _reading(encoder, "a T5 encoder"):
         loaded: Any = transformers.T5EncoderModel.from_pretrained(
-            encoder, local_files_only=True, dtype="auto", output_loading_info=True
+            encoder, local_files_only=True, dtype="auto", output_loading_info=True, **where
         )
         model, report = loaded
     wrong = {*report["missing_keys"], *report["unexpected_keys"]}

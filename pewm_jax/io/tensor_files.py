@@ -37,7 +37,7 @@ files."""
 _TENSORS, _HEADER = "sha256", "header_sha256"
 """The keys of checksums: of each tensor, and of the header with zeros in place of this one."""
 _NO_DIGEST = "0" * 64
-_BLOCK = 16 << 20
+_BLOCK = 1 << 20
 """Bytes of an array in another order of axes that are copied at once when it is written."""
 _DTYPES = {"BOOL": np.dtype(bool), "BF16": np.dtype(jnp.bfloat16)} | {
     f"{letter}{8 * size}": np.dtype(f"{letter.lower()}{size}")

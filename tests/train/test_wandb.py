@@ -109,3 +109,16 @@ def test_a_login_that_is_missing_is_one_sentence(model, monkeypatch, tmp_path):
 def test_a_run_may_be_sent_elsewhere_when_it_goes_on(tmp_path):
     plain, asked = fakes.config(tmp_path), fakes.config(tmp_path, log=("wandb:rooms",))
     assert not runs.differences(runs.identity(plain), runs.identity(asked))
+
+
+def test_no_log_is_written_if_none_is_asked_for(model, tmp_path):
+    loop.train(fakes.config(tmp_path, stage1=1, stage2=1, log=("none",)))
+    logs = {"metrics.jsonl", "tensorboard", "rerun", "wandb", "wandb.id"}
+    assert not logs & {path.name for path in tmp_path.iterdir()}
+
+
+def test_logs_may_change_when_a_run_is_resumed(model, tmp_path):
+    loop.train(fakes.config(tmp_path, stage1=2, stage2=2, log=("none",)))
+    assert not runs.differences(
+        *(runs.identity(fakes.config(tmp_path, log=log)) for log in (("none",), ("jsonl",)))
+    )

@@ -226,7 +226,8 @@ class _Videos:
         """End an episode of a number of frames; return its place in the videos."""
         assert self._video is not None
         last = self._video.frames
-        place = {f"videos/{self.key}/{name}": value for name, value in _number(self._index).items()}
+        at: dict[str, float] = {**_number(self._index)}
+        place = {f"videos/{self.key}/{name}": value for name, value in at.items()}
         place[f"videos/{self.key}/from_timestamp"] = (last - length) / self.fps
         place[f"videos/{self.key}/to_timestamp"] = last / self.fps
         if self._video.bytes >= VIDEO_MB * 1e6 * FULL:
@@ -361,8 +362,13 @@ def _write_meta(
     place.mkdir(parents=True)
     parquet.write_table(arrow.Table.from_pylist(rows), place / "file-000.parquet")
     names = arrow.table({"task_index": list(tasks.values()), "task": list(tasks)})
-    pandas = {
-        "index_columns": ["task"], "columns": [], "column_indexes": [],
+    kinds = (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    columns = [
+        dict(zip(("name", "field_name", "pandas_type", "numpy_type", "metadata"), row, strict=True))
+        for row in ((name, name, kind, dtype, None) for name, kind, dtype in kinds)
+    ]
+    pandas = {  # the package reads the texts as an index of pandas
+        "index_columns": ["task"], "columns": columns, "column_indexes": [],
         "creator": {"library": "pyarrow", "version": arrow.__version__}, "pandas_version": "2.0.0",
     }  # fmt: skip
     names = names.replace_schema_metadata({"pandas": json.dumps(pandas)})

@@ -1,11 +1,10 @@
-"""``pewm-jax data export``: its settings, and the episodes that it writes."""
+"""Settings of ``pewm-jax data export``, and the episodes that it writes."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,19 +15,8 @@ from pewm_jax.data import dataset
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import Episode
 from pewm_jax.io import atomic
-from pewm_jax.io.progress import Meter
 
 Formats = Literal["lerobot", "rlds", "rerun", "ply", "glb", "mp4"]
-WRITERS = {
-    "lerobot": "pewm_jax.data.exports.lerobot:export",
-    "rlds": "pewm_jax.data.exports.rlds:export",
-    "rerun": "pewm_jax.data.exports.recording:export",
-    "ply": "pewm_jax.data.exports.points:export",
-    "glb": "pewm_jax.data.exports.points:export",
-    "mp4": "pewm_jax.data.exports.video:export",
-}
-"""Format → ``MODULE:FUNCTION`` that writes it, given ``ExportConfig``, what to write (``Chosen``,
-or one episode if the format is in ``SUFFIX``), and the path."""
 SUFFIX = {"rerun": ".rrd", "ply": ".ply", "glb": ".glb", "mp4": ".mp4"}
 """Formats with one file per episode → its suffix."""
 
@@ -88,38 +76,6 @@ class Chosen:
         """Return the number of episodes by split."""
         names = [split for split, _, _ in self.places]
         return {name: names.count(name) for name in dict.fromkeys(names)}
-
-
-def export(config: ExportConfig, log: Callable[[str], None] = print) -> None:
-    """Run ``data export``.
-
-    Raises:
-        UserError: SRC is no data set, DST exists, the episodes do not fit the format, or a package
-            is not installed.
-    """
-    module, _, name = WRITERS[config.format].partition(":")
-    chosen = choose(config)
-    write = getattr(importlib.import_module(module), name)
-    suffix = SUFFIX.get(config.format)
-    if suffix is None:
-        with new(config.dst) as folder:
-            write(config, chosen, folder)
-        log(f"{config.dst}: {len(chosen)} episodes as {config.format}")
-    elif config.dst.suffix.lower() == suffix:
-        split, episode = next(iter(chosen))
-        with new(config.dst) as file:
-            write(config, episode, file)
-        log(f"{config.dst}: {episode.name} of {split}, {episode.length} frames")
-    else:
-        with (
-            new(config.dst) as folder,
-            Meter(f"write {config.dst}", len(chosen), "episodes") as meter,
-        ):
-            folder.mkdir()
-            for (split, _, index), (_, episode) in zip(chosen.places, chosen, strict=True):
-                write(config, episode, folder / f"{split}-{index:06d}{suffix}")
-                meter.advance(1)
-        log(f"{config.dst}: {len(chosen)} episodes, a file of each")
 
 
 @contextlib.contextmanager

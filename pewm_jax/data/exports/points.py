@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -58,7 +59,7 @@ def write(path: Path, points_N3: np.ndarray, colours_N3: np.ndarray) -> None:
     kind = path.suffix.lower().removeprefix(".")
     if kind == "glb":
         cloud.apply_transform(UPRIGHT)
-        data = trimesh.Scene({"map": cloud}).export(file_type="glb")
+        data: Any = trimesh.Scene({"map": cloud}).export(file_type="glb")
     else:
         data = cloud.export(file_type="ply")
     path.write_bytes(data)

@@ -30,7 +30,8 @@ class Video:
         odd = bool(size[0] % 2 or size[1] % 2)
         self.pix_fmt = "gray12le" if grey12 else "yuv444p" if odd else "yuv420p"
         self._stream.pix_fmt = self.pix_fmt
-        options = {"x265-params": "lossless=1:log-level=error"} if grey12 else {"crf": "18"}
+        lossless = {"x265-params": "lossless=1:log-level=error", "preset": "ultrafast"}
+        options = lossless if grey12 else {"crf": "18", "preset": "veryfast"}
         self._stream.options = {"g": str(GOP), **options}
         self._format = "gray12le" if grey12 else "rgb24"
         self.frames = self.bytes = 0  # that are encoded so far
