@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pewm_jax import presets
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import read_episode
+from pewm_jax.eval import loaded_run
 from pewm_jax.eval import protocol as protocols
-from pewm_jax.eval.clips import choose, long_choices
+from pewm_jax.eval.clips import choose, fingerprint, long_choices
 from tests.eval.scene import record, tiny, write_split
 
 
@@ -219,3 +221,14 @@ def test_another_protocol_is_not_written_over(episodes, tmp_path):
     fewer = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, clips=2))
     with pytest.raises(UserError, match=r"another protocol \(4 and 2 clips\)"):
         protocols.write_protocol(fewer, path, said.append)
+
+
+def test_reports_of_8_bit_weights_have_a_folder_and_a_fingerprint_of_their_own():
+    config = presets.load("tiny")
+    small = dataclasses.replace(
+        config, evaluate=dataclasses.replace(config.evaluate, quantize="int8")
+    )
+    run = loaded_run.LoadedRun(Path("run"), Path("run"), config, {}, "hash")
+    assert loaded_run.report_folder(run, config) == Path("run/report")
+    assert loaded_run.report_folder(run, small) == Path("run/report-int8")
+    assert fingerprint(config, "hash", "data") != fingerprint(small, "hash", "data")
