@@ -27,6 +27,8 @@ EXAMPLES = {
         "pewm_5b --devices 64 --chip h200",
         "pewm_2b --devices 8 --chip h100 --train.mesh.fsdp 8",
         "pewm_2b --devices 8 --chip v5p --compiler target --json plan.json",
+        "pewm_2b --devices 8 --chip h100 --compiler target --fit",
+        "pewm_2b --chip h100 --compiler target --inference",
     ),
 }
 ABOUT = {

@@ -114,8 +114,8 @@ def cache_compilation(folder: str | Path) -> None:
         if getattr(jax.config, name) == default:
             jax.config.update(name, ours)
 
-    def seal(event: str, seconds: float, **_: Any) -> None:
-        del seconds
+    def seal(event: str, duration_secs: float, **_: Any) -> None:
+        del duration_secs
         if event == COMPILED:
             seals.add_new()
 

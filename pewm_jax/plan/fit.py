@@ -286,7 +286,7 @@ def remat_settings(settings: Any, prefix: str = "") -> list[str]:
         value = getattr(settings, field.name)
         if field.name == REMAT and isinstance(value, bool):
             found.append(f"{prefix}{field.name}")
-        elif dataclasses.is_dataclass(value):
+        elif _has_fields(value):
             found += remat_settings(value, f"{prefix}{field.name}.")
     return found
 
@@ -303,9 +303,13 @@ def _changes(settings: Any, remat: bool) -> dict[str, Any]:
         value = getattr(settings, field.name)
         if field.name == REMAT and isinstance(value, bool):
             changed[field.name] = remat
-        elif dataclasses.is_dataclass(value) and (inner := _changes(value, remat)):
+        elif _has_fields(value) and (inner := _changes(value, remat)):
             changed[field.name] = dataclasses.replace(value, **inner)
     return changed
+
+
+def _has_fields(value: Any) -> bool:
+    return dataclasses.is_dataclass(value) and not isinstance(value, type)
 
 
 def line(found: Try) -> str:

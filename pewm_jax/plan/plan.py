@@ -1,7 +1,9 @@
 """Plan a training run on absent hardware: ``pewm-jax plan PRESET``.
 
 The real step is traced and compiled from shapes alone: no data is read, no weights are created, no
-folder is written. ``--compiler target`` uses the chip's own compiler (``target_compiler``).
+folder is written. ``--compiler target`` uses the chip's own compiler (``target_compiler``); with
+``--fit`` it searches for settings (``fit``), with ``--inference`` it compiles what a trained model
+runs (``inference``).
 ``--compiler cpu`` compiles for the requested number of virtual CPU devices: ``measure`` determines
 the computation, memory and communication of the step, ``suggest`` predicts time and memory on the
 chip. A network without scanned blocks gives a program so large that compiling it takes too long for
