@@ -143,7 +143,10 @@ def _merge_into_pipeline(published: Mapping[str, Published], dst: Path, base: Pa
                 shutil.copytree(part, folder / part.name)
             elif part.is_file():
                 shutil.copyfile(part, folder / part.name)
-        cogvideox.write_network(config, merged, folder / network.folder)
+        inside = folder / network.folder
+        inside.mkdir()
+        configuration.save(config, inside / runs.CONFIG)
+        weights.save(inside / runs.WEIGHTS, merged)
 
 
 def read_published(src: Path) -> dict[str, Published]:

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 from pewm_jax.errors import UserError
-from pewm_jax.io import tree
 
 PREFIX = "hf://"
 """Optional beginning of a name; it is needed only if a folder here is called like the name's
@@ -161,6 +160,9 @@ def verify(folder: Path, wanted: Sequence[str] = ("*",)) -> None:
             content.unlink()
             path.unlink()
     if damaged:
+        # Imported here: it imports JAX, which help does without.
+        from pewm_jax.io import tree  # noqa: PLC0415
+
         raise UserError(
             f"{title(folder)}: {tree.listing(damaged)} in the cache is damaged, its hash is not "
             "the one that the hub states; it is removed: run the same command again to download it."

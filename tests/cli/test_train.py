@@ -238,6 +238,9 @@ COMMANDS = {
     "demo": ("pewm-jax demo", ["-m", "pewm_jax", "demo"]),
     "table2": ("pewm-jax table2", ["-m", "pewm_jax", "table2"]),
     "practice": ("pewm-jax practice", ["-m", "pewm_jax", "practice"]),
+    "show": ("pewm-jax show", ["-m", "pewm_jax", "show"]),
+    "pull": ("pewm-jax pull", ["-m", "pewm_jax", "pull"]),
+    "push": ("pewm-jax push", ["-m", "pewm_jax", "push"]),
     "horizon": ("pewm-jax horizon", ["-m", "pewm_jax", "horizon"]),
     "table1": ("pewm-jax table1", ["-m", "pewm_jax", "table1"]),
 }
