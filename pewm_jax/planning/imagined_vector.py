@@ -74,7 +74,8 @@ class ImaginedVectorEnv(gymnasium.vector.VectorEnv):
             autoreset_mode != AutoresetMode.SAME_STEP,
             "autoreset_mode is SAME_STEP: use NEXT_STEP or DISABLED.",
         )
-        self.metadata = {**self.metadata, "autoreset_mode": autoreset_mode}
+        # Gymnasium reads it from the environment, and declares it for the class.
+        vars(self)["metadata"] = {**self.metadata, "autoreset_mode": autoreset_mode}
         self.num_envs = num_envs
         self.envs = [WorldModelEnv(model, params, one, **settings) for one in houses]
         self.single_observation_space = self.envs[0].observation_space
@@ -113,7 +114,7 @@ class ImaginedVectorEnv(gymnasium.vector.VectorEnv):
         mask = np.asarray(options.pop("reset_mask", np.ones(self.num_envs, bool)))
         infos: dict[str, Any] = {}
         started = {}
-        for number in np.flatnonzero(mask):
+        for number in np.flatnonzero(mask).tolist():
             env = self.envs[number]
             self._observed[number], info = env.reset(seed=seeds[number], options=options or None)
             infos = self._add_info(infos, info, number)

@@ -77,7 +77,7 @@ class GymnasiumVecEnv(VecEnv):
         self._lengths += 1
         infos: list[dict[str, Any]] = [{} for _ in done]
         looked = self._look(seen)
-        for number in np.flatnonzero(done):
+        for number in np.flatnonzero(done).tolist():
             infos[number] = {
                 "terminal_observation": _row(looked, number),
                 "TimeLimit.truncated": bool(cut[number] and not ended[number]),
