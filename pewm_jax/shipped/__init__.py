@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pewm_jax.errors import UserError
 from pewm_jax.io import hub
 
 HERE = Path(__file__).parent
@@ -28,14 +29,20 @@ def find(path: str | Path, revision: str | None = None) -> Path:
         revision: of a model on a hub: a branch, a tag or a commit.
 
     Raises:
-        UserError: the model cannot be had from the hub; see ``hub.find``.
+        UserError: the model cannot be had from the hub (see ``hub.find``), or a revision is given
+            for a folder.
     """
     folder = Path(path)
     if folder.exists():
-        return folder
-    if str(path) in names():
-        return HERE / str(path)
-    return hub.find(path, revision=revision) or folder
+        found: Path | None = folder
+    elif str(path) in names():
+        found = HERE / str(path)
+    else:
+        found = hub.find(path, revision=revision)
+        revision = None
+    if revision is not None:
+        raise UserError(f"{path} is a folder, which has no revision {revision}; omit the revision.")
+    return found or folder
 
 
 def home(path: str | Path) -> Path:

@@ -91,6 +91,8 @@ def test_a_revision_is_pinned(server, run):
     assert shipped.home(NAME) == Path("runs/rooms")
     with pytest.raises(UserError, match="has no revision none; choose another"):
         pewm_jax.load(NAME, revision="none")
+    with pytest.raises(UserError, match="is a folder, which has no revision x; omit"):
+        pewm_jax.load(run, revision="x")
     with pytest.raises(UserError, match="give one revision"):
         pewm_jax.load(f"{NAME}@{first}", revision=second)
 
