@@ -76,7 +76,7 @@ COMMANDS = {
         "pewm_jax.data.exports.command:export",
     ),
     "show": Command(
-        "imagine along an episode, and write it for Rerun, as points or a video",
+        "imagine along an episode; write it for Rerun, as points or video",
         f"{CLI}.show:Settings",
         f"{CLI}.show:run",
     ),
@@ -192,7 +192,7 @@ COMMANDS = {
 GROUPS = {
     "data": "collect, import, validate, show and export episodes",
     "memory": "compute the image encoder's features of a data set once",
-    "convert": "import CogVideoX, SVD, Cosmos or DINOv2, merge adapters, export trained weights",
+    "convert": "import CogVideoX, SVD, Cosmos, DINOv2 or adapters; export weights",
     "convert import": "read a checkpoint of another library",
     "convert export": "write weights for another program",
 }
