@@ -81,6 +81,7 @@ def test_off_changes_nothing():
     )
 
 
+@pytest.mark.slow
 def test_a_world_keeps_what_its_memory_shows():
     """Where the memory was seen, imagined latents are those of the rendering; elsewhere not."""
     noise = dataclasses.replace(NOISE, rendered_until=0.01, sigma_min=0.02)

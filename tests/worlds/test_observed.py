@@ -190,6 +190,7 @@ def test_a_prepared_batch_has_the_same_loss(observed, chained):
     np.testing.assert_allclose(loss(params, ready), loss(params, clip), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_chained_clips_are_not_shown_the_true_frame(monkeypatch):
     """The frame that is warped is the one the clip starts from, also where clips are prepared."""
     config = config_of("warped", chained=1.0, image_noise_mean=-20.0)
