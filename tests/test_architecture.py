@@ -46,7 +46,7 @@ PACKAGES = [
 HOMES = {
     "accelerate": set(),
     "array_record": {"data/dataset"},
-    "av": {"data/exports/video", "data/formats/video", "report/video"},
+    "av": {"data/formats/video", "io/video"},
     "diffusers": set(),
     "embreex": {"data/shading", "data/scenes"},
     "evo": set(),

@@ -19,6 +19,9 @@ from jax.core import Tracer
 from pewm_jax.config import UserError
 from pewm_jax.types import Array, Camera
 
+Y_UP_FROM_Z_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+"""Turns our world, z up, into that of glTF and of Habitat, y up."""
+
 
 def matmul(a: Array, b: Array) -> Array:
     """Return ``a @ b`` in full float32 precision on all platforms."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from pewm_jax.config import Memory, UserError
 from pewm_jax.config.parts import Encoder
+from pewm_jax.geometry.cameras import Y_UP_FROM_Z_UP
 from pewm_jax.io import atomic, weights
 from pewm_jax.memory import cells
 from pewm_jax.types import Array, VoxelMap
@@ -101,8 +102,6 @@ def _check(config: Memory, path: Path, metadata: dict, tensors: dict) -> None:
 
 FILLED = 0.9
 """Side of a cube over the side of its cell; the gap makes neighbours distinguishable."""
-UPRIGHT = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-"""The world's z axis becomes the y axis of glTF."""
 
 
 def write(
@@ -144,7 +143,7 @@ def write(
     else:
         shape = trimesh.PointCloud(points, colours)
     if kind == ".glb":
-        shape = trimesh.Scene({"map": shape.apply_transform(UPRIGHT)})
+        shape = trimesh.Scene({"map": shape.apply_transform(Y_UP_FROM_Z_UP)})
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic.replacing(path) as partial:
         data: Any = shape.export(file_type=kind[1:])

@@ -14,8 +14,8 @@ import numpy as np
 from pewm_jax.config import UserError, serialize
 from pewm_jax.errors import require
 from pewm_jax.io import tree, weights
+from pewm_jax.io.video import Video
 from pewm_jax.play.engine import Engine
-from pewm_jax.report.video import Film
 from pewm_jax.types import WorldState
 
 FORMAT, SUFFIX = "world 1", ".world.safetensors"
@@ -94,7 +94,7 @@ class DriveFilm:
         number = 1 + max((int(text) for text in numbers if text.isdigit()), default=0)
         self._path = folder / f"drive-{number:03d}.mp4"
         self._partial = self._path.with_name(f"{self._path.name}.{os.getpid()}.partial")
-        self._film = Film(str(self._partial), picture_HWC.shape[:2], FPS)
+        self._film = Video(self._partial, picture_HWC.shape[:2], FPS)
         self._film.add(picture_HWC)
 
     def add(self, picture_HWC: np.ndarray) -> None:

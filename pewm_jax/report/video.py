@@ -5,10 +5,10 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 
-import av
 import numpy as np
 from PIL import Image, ImageDraw
 
+from pewm_jax.io.video import Video
 from pewm_jax.report.pictures import PAPER, QUIET, as_bytes, depth_colours, enlarge, write
 
 
@@ -89,39 +89,8 @@ def encode_h264(pictures: Sequence[np.ndarray], frames_per_second: int = 4) -> b
     Equal images give equal bytes.
     """
     buffer = io.BytesIO()
-    film = Film(buffer, pictures[0].shape[:2], frames_per_second)
+    film = Video(buffer, pictures[0].shape[:2], frames_per_second)
     for picture in pictures:
         film.add(picture)
     film.close()
     return buffer.getvalue()
-
-
-class Film:
-    """An MP4 with H.264 that is written image by image, so that none has to be stored.
-
-    x264 is used without its macroblock tree, whose vectorised code reads uninitialised memory: with
-    it, a few bits differ from run to run.
-    """
-
-    def __init__(self, where: io.BytesIO | str, size: tuple[int, int], frames_per_second: int = 4):
-        """Open a buffer or the path of a file, for images of an even height and width."""
-        self._container = av.open(where, "w", format="mp4")
-        self._stream = self._container.add_stream("libx264", rate=frames_per_second)
-        self._stream.height, self._stream.width = size
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {
-            "crf": "21",
-            "preset": "medium",
-            "threads": "1",
-            "x264-params": "mbtree=0",
-        }
-
-    def add(self, picture: np.ndarray) -> None:
-        """Append a uint8 (H, W, 3) image of the film's size."""
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-        self._container.mux(self._stream.encode(frame))
-
-    def close(self) -> None:
-        """Flush and finish the file."""
-        self._container.mux(self._stream.encode())
-        self._container.close()

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.exports.options import Chosen, ExportConfig, require_alike
-from pewm_jax.data.exports.video import GOP, Video
+from pewm_jax.data.exports.video import GOP, open_video
 from pewm_jax.io.progress import Meter
 
 RGB, DEPTH = "observation.images.camera", "observation.images.camera_depth"
@@ -218,7 +218,7 @@ class _Videos:
             path = self._folder / "videos" / self.key / name
             path.parent.mkdir(parents=True, exist_ok=True)
             size = (image.shape[0], image.shape[1])
-            self._video = Video(path, size, self.fps, grey12=self.key == DEPTH)
+            self._video = open_video(path, size, self.fps, grey12=self.key == DEPTH)
             self.pix_fmt = self._video.pix_fmt
         self._video.add(image)
 

@@ -12,9 +12,7 @@ from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.exports.options import ExportConfig
 from pewm_jax.data.voxels import measured_points
-
-UPRIGHT = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-"""The world's z axis becomes the y axis of glTF."""
+from pewm_jax.geometry.cameras import Y_UP_FROM_Z_UP
 
 
 class Fusion:
@@ -58,7 +56,7 @@ def write(path: Path, points_N3: np.ndarray, colours_N3: np.ndarray) -> None:
     cloud = trimesh.PointCloud(points_N3, colours_N3)
     kind = path.suffix.lower().removeprefix(".")
     if kind == "glb":
-        cloud.apply_transform(UPRIGHT)
+        cloud.apply_transform(Y_UP_FROM_Z_UP)
         data: Any = trimesh.Scene({"map": cloud}).export(file_type="glb")
     else:
         data = cloud.export(file_type="ply")
