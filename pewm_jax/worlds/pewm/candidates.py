@@ -89,11 +89,15 @@ def imagine_clip(
     draw = functools.partial(world_model.draw, model, params)
     latents = jax.vmap(draw)(conditioning, batched, keys)[:, 0]
     seen = slice(shown.start + 1, shown.stop + 1)  # frame 0 of a clip is the present one
-    decoded = seen
     if model.codec.framewise:  # only the frames that are returned are decoded
-        latents, decoded = latents[:, seen], slice(None)
-    rgb, depth = rgbd.decode_rgbd(model, params, latents)
-    rgb, depth = rgb[:, decoded], depth[:, decoded]
+        rgb, depth = rgbd.decode_rgbd(model, params, latents[:, seen])
+    else:  # one candidate at a time: a video codec's activations need more memory than the rest
+
+        def decode(latents_thwC: Array) -> tuple[Array, Array]:
+            rgb, depth = rgbd.decode_rgbd(model, params, latents_thwC[None])
+            return rgb[0, seen], depth[0, seen]
+
+        rgb, depth = jax.lax.map(decode, latents)
     if readout is not None and readout.view is not None and memories.gated(model):
         remembered_there = jax.tree.map(lambda x: x[:, seen], readout.view)
         rgb, depth = rgbd.mix(model, params, rgb, depth, remembered_there)
