@@ -120,6 +120,24 @@ class PosedFiles:
         return found
 
 
+def with_lost(
+    frames: np.ndarray, table: dict[str, np.ndarray], seen: Sequence[int], tail: int
+) -> np.ndarray:
+    """Return the frames in order, and complete the columns of ``table`` with lost poses.
+
+    Frames that are seen and have no row get one that is not a number; up to ``tail`` frames after
+    the last row are left out instead.
+    """
+    lost, last = np.setdiff1d(seen, frames), frames.max(initial=-1)
+    if (lost > last).sum() <= tail:
+        lost = lost[lost < last]
+    together = np.append(frames, lost)
+    order = np.argsort(together, kind="stable")
+    for name, column in table.items():
+        table[name] = np.append(column, np.full(len(lost), np.nan))[order]
+    return together[order].astype(int)
+
+
 def by_time(folder: Path, end: str) -> dict[float, Path]:
     """Return files by the time in their names, ``SCAN_TIME.png``."""
     found = {}
