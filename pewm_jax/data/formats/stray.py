@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from pewm_jax.config import UserError
 from pewm_jax.data.formats import video
 from pewm_jax.data.formats.options import ImportConfig
-from pewm_jax.data.formats.posed_files import Files, with_lost
+from pewm_jax.data.formats.posed_files import Files, paired
 from pewm_jax.data.formats.reader import (
     BadFrameError,
     Entry,
@@ -64,11 +64,8 @@ class Stray(FolderFormat):
         depths = Files("depth images", folder / "depth", "", (".png", ".npy"))
         times = video.frame_times(folder / "rgb.mp4")
         frames = table.get("frame", np.arange(len(table["x"]))).astype(int)
-        last = max(depths.names, default=-1)
-        cut = int(((frames > last) | (frames >= len(times))).sum())
-        count = len(frames) - (cut if cut <= TAIL else 0)
-        table = {name: column[:count] for name, column in table.items()}
-        frames = with_lost(frames[:count], table, [k for k in depths.names if k < len(times)], TAIL)
+        seen = [k for k in depths.names if k < len(times)]
+        frames, table = paired(frames, table, seen, TAIL)
         recording = _Recording(folder, options, table, frames, depths, times)
         return Entry(folder.resolve().name, len(frames), recording.open)
 
