@@ -20,6 +20,8 @@ from pewm_jax.houses.floorplan import largest_region
 
 STEP_M = 0.12
 """Largest height difference on one floor, metres."""
+NEAR_M = 0.4
+"""Largest distance of a storey's floor from the height that is given for it, metres."""
 _HEIGHTS = (0.15, 0.4, 0.7, 1.0)
 """Heights at which obstacles are tested, as fractions of the agent's height."""
 
@@ -65,6 +67,7 @@ def navigable(
     cell_m: float = 0.1,
     agent_radius_m: float = 0.2,
     agent_height_m: float = 1.2,
+    near_z: float | None = None,
 ) -> NavGrid:
     """Return the cells in which an agent can stand.
 
@@ -73,13 +76,15 @@ def navigable(
         cell_m: side of a grid cell, metres.
         agent_radius_m: the agent's radius; free cells keep this distance from obstacles.
         agent_height_m: the agent passes under obstacles above this height.
+        near_z: a height near the floor of the wanted storey, metres.
 
     Returns:
-        The largest connected region of free cells, on the storey with most floor.
+        The largest connected region of free cells, on the wanted storey, by default the lowest with
+        much floor.
 
     Raises:
         UserError: the sizes are not positive, the scene is too wide for the cell, or there is
-            no free cell.
+            no floor or no free cell.
     """
     if min(cell_m, agent_radius_m, agent_height_m) <= 0:
         raise UserError("cell_m, agent_radius_m and agent_height_m must all be above 0 metres.")
@@ -91,7 +96,7 @@ def navigable(
             f"{scene.name} spans {high[0] - low[0]:.0f} x {high[1] - low[1]:.0f} m, too much for "
             f"cells of {cell_m} m: check that its unit is metres, or use larger cells."
         )
-    floor_z = estimate_floor(scene)
+    floor_z = estimate_floor(scene, near_z=near_z)
     x, y = (origin[i] + (np.arange(n) + 0.5) * cell_m for i, n in enumerate((columns, rows)))
     centres = np.stack(np.meshgrid(x, y), -1)
     stand = np.abs(_landing(scene, centres, floor_z + agent_height_m) - floor_z) <= STEP_M
@@ -107,8 +112,11 @@ def navigable(
     return NavGrid(region, origin, cell_m, floor_z)
 
 
-def estimate_floor(scene: Scene, bin_m: float = 0.1) -> float:
-    """Return the height of the lowest level that has much upward-facing area, metres."""
+def estimate_floor(scene: Scene, bin_m: float = 0.1, near_z: float | None = None) -> float:
+    """Return the height of the lowest level that has much upward-facing area, metres.
+
+    With ``near_z``, only levels within ``NEAR_M`` of it are considered.
+    """
     corners = scene.vertices_V3[scene.faces_F3]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     flat = scene.normals_F3[:, 2] > 0.9
@@ -116,6 +124,10 @@ def estimate_floor(scene: Scene, bin_m: float = 0.1) -> float:
         flat = np.abs(scene.normals_F3[:, 2]) > 0.9
     if not flat.any():
         raise UserError(f"{scene.name} has no level surface to stand on: check that z is up.")
+    if near_z is not None:
+        flat &= np.abs(corners.mean(1)[:, 2] - near_z) <= NEAR_M
+        if not flat.any():
+            raise UserError(f"{scene.name} has no floor near the height {near_z:.2f} m.")
     z = corners[flat].mean(1)[:, 2]
     area = np.linalg.norm(cross[flat], axis=-1)
     index = np.round((z - z.min()) / bin_m).astype(int)

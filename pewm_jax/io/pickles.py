@@ -39,10 +39,16 @@ _STORAGES = {
 }
 _KINDS = "fiub"
 """Kinds of NumPy dtypes that are read: numbers and booleans, no objects."""
+WEIGHTS = "save its tensors as safetensors, or with torch.save of torch 1.6 or newer"
+"""What to do about refused weights."""
 
 
-def read(path: Path) -> Tensors:
+def read(path: Path, remedy: str = WEIGHTS) -> Tensors:
     """Read nested dictionaries of arrays from a pickle of NumPy arrays or a file of ``torch.save``.
+
+    Args:
+        path: the file.
+        remedy: what to do, in the sentence that refuses a file.
 
     Raises:
         UserError: the file is missing or damaged, contains anything but tensors in tables, or has
@@ -58,8 +64,7 @@ def read(path: Path) -> Tensors:
     except Exception as error:  # a damaged pickle may raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
         raise UserError(
-            f"{path} cannot be read as a table of tensors ({reason[:160]}); save its tensors as "
-            "safetensors, or with torch.save of torch 1.6 or newer."
+            f"{path} cannot be read as a table of tensors ({reason[:160]}); {remedy}."
         ) from error
 
 

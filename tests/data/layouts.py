@@ -231,8 +231,11 @@ def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None):
     return folder
 
 
-def habitat(folder, start, yaw, path=(), goal=None):
-    """The box as a GLB with y up, and one episode; positions are given in our world."""
+def habitat(folder, start, yaw, path=(), goal=None, category=""):
+    """The box as a GLB with y up, and one episode; positions are given in our world.
+
+    With a category the goal is that of object navigation: an object, seen from a view point.
+    """
     box = trimesh.creation.box(bounds=[LOW, HIGH])
     box.invert()
     box.visual.vertex_colors = np.tile([90, 160, 200, 255], (len(box.vertices), 1))
@@ -253,10 +256,19 @@ def habitat(folder, start, yaw, path=(), goal=None):
         "start_rotation": turn,
         "goals": [{"position": up(goal)}] if goal is not None else [],
     }
+    table = {"episodes": [episode]}
+    if category:
+        view = {"agent_state": {"position": up(goal), "rotation": [0, 0, 0, 1]}, "iou": 0.2}
+        on_table = {"object_id": 9, "position": up(np.add(goal, [0.3, 0, 0.8]))}
+        other = {"object_id": 3, "position": up(start), "view_points": []}
+        goals = [other, on_table | {"view_points": [view]}]
+        table["goals_by_category"] = {f"TEEsavR23oF.basis.glb_{category}": goals}
+        episode |= {"goals": [], "object_category": category}
+        episode["info"] = {"closest_goal_object_id": 9}
     if len(path):
         episode["reference_path"] = [up(point) for point in path]
     content = folder / "datasets/objectnav/hm3d/v1/val/content"
     content.mkdir(parents=True)
     with gzip.open(content / "TEEsavR23oF.json.gz", "wt") as file:
-        json.dump({"episodes": [episode]}, file)
+        json.dump(table, file)
     return folder

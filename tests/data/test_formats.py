@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import pickle
 import shutil
@@ -208,6 +209,43 @@ def test_an_episode_of_habitat_walks_to_its_goal(tmp_path):
         imported(src, tmp_path / "x", "habitat")
 
 
+def test_an_object_goal_of_habitat_is_found_by_its_category(tmp_path):
+    src = layouts.habitat(tmp_path / "src", (2, 2, 0.0), 2.0, (), (4.5, 3.0, 0.0), "chair")
+    (episode,), _ = imported(src, tmp_path / "out", size=(32, 32))
+    np.testing.assert_allclose(episode.world_from_camera[-1, :2, 3], [4.5, 3.0], atol=0.1)
+
+
+@pytest.mark.parametrize(
+    ("start", "goal", "says"),
+    [
+        ((2, 2, 0), None, "has no reference path and no goal away from its start"),
+        ((2, 2, 0), (2, 2, 0), "has no reference path and no goal away from its start"),
+        ((50, 2, 0), (2, 2, 0), r"starts 4\d\.\d m from where an agent can stand"),
+        ((2, 2, 0), (50, 2, 0), r"has its goal 4\d\.\d m from where an agent can stand"),
+        ((2, 2, 9.0), (3, 3, 9.0), "starts where no floor is"),
+        ((2, 2, 0), (3, 3, 2.6), "has its goal on another storey"),
+    ],
+)
+def test_an_episode_of_habitat_without_a_way_is_left_out_and_named(tmp_path, start, goal, says):
+    src = layouts.habitat(tmp_path / "src", start, 0.5, goal=goal)
+    with pytest.raises(UserError, match=says) as refused:
+        imported(src, tmp_path / "out", "habitat", size=(32, 32))
+    assert "\n" not in str(refused.value)
+    path = next(src.rglob("*.json.gz"))
+    with gzip.open(path, "rt") as file:
+        (lost,) = json.load(file)["episodes"]
+    walked = lost | {
+        "episode_id": "8",
+        "start_position": [2, 0, -2],
+        "reference_path": [[3, 0, -2]],
+    }
+    with gzip.open(path, "wt") as file:
+        json.dump({"episodes": [lost, walked]}, file)
+    source, lines = imported(src, tmp_path / "out", "habitat", size=(32, 32))
+    assert [episode.length > 1 for episode in source] == [True]
+    assert "note: 1 of 2 episodes are left out; first: episode 7" in lines
+
+
 def test_every_format_is_recognised_and_nothing_is_not(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="none of the known layouts"):
@@ -275,7 +313,7 @@ BAD = {
     ("stray", "a truncated video"): (cut_video, "cannot be decoded as a video|has no frame"),
     ("nomad", "a missing image"): (lose("*.jpg"), "11 images, 12 poses"),
     ("nomad", "a truncated image"): (truncate("*.jpg"), "damaged or truncated"),
-    ("nomad", "a truncated pickle"): (truncate("*.pkl", 0), "cannot be read as a table"),
+    ("nomad", "a truncated pickle"): (truncate("*.pkl", 0), "only arrays of numbers are read"),
     ("lerobot", "a missing video"): (lose("*.mp4", 0), "does not exist"),
     ("lerobot", "a truncated video"): (cut_video, "cannot be decoded as a video|has no frame"),
     ("lerobot", "truncated rows"): (truncate("data/**/*.parquet", 0), "cannot be read as Parquet"),
@@ -335,6 +373,19 @@ def test_a_frame_with_a_lost_pose_is_left_out_and_named(tmp_path, name):
     assert "1 frame left out because the pose is lost; first: " in lines
     assert episode.info["left_out"] == [4]
     np.testing.assert_allclose(episode.world_from_camera, np.delete(walk.pose, 4, 0), atol=1e-4)
+
+
+@pytest.mark.parametrize(("rows", "lost"), [([5], [4]), (range(8, 13), [*range(7, 12)])])
+def test_frames_without_a_line_of_odometry_are_lost(tmp_path, rows, lost):
+    src, walk = written(tmp_path, "stray")
+    for row in sorted(rows, reverse=True):
+        rewrite(src / "odometry.csv", row, None)
+    (episode,), lines = imported(src, tmp_path / "out", "stray")
+    assert f"{len(lost)} frame" in lines
+    assert "left out because the pose is lost" in lines
+    assert episode.info["left_out"] == lost
+    expected = np.delete(walk.pose, lost, 0)
+    np.testing.assert_allclose(episode.world_from_camera, expected, atol=1e-4)
 
 
 def test_a_folder_of_several_scans_is_one_import(tmp_path):

@@ -139,6 +139,18 @@ def test_every_room_of_a_house_can_be_reached_through_its_doorways(seed):
     assert grid.area > 3.0 * len(scene.metadata["rooms"])
 
 
+def test_the_storey_near_a_height_is_found():
+    upstairs = block((0, 3), (0, 4), (2.8, 3.0))
+    scene = room(upstairs)
+    assert nav.navigable(scene).floor_z == pytest.approx(0, abs=1e-6)
+    grid = nav.navigable(scene, near_z=3.1)
+    assert grid.floor_z == pytest.approx(3.0, abs=1e-6)
+    assert nav.is_free(grid, np.array([1.5, 2.0]))
+    assert not nav.is_free(grid, np.array([4.5, 2.0]))
+    with pytest.raises(UserError, match="no floor near the height"):
+        nav.navigable(scene, near_z=1.5)
+
+
 def test_places_where_nobody_can_stand_are_refused_in_a_sentence():
     with pytest.raises(UserError, match="no place where an agent"):
         nav.navigable(room(), agent_radius_m=2.5)

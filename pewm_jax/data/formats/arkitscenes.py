@@ -91,7 +91,9 @@ def _open(
     own = np.full((len(times), 4), np.nan)
     for k, path in enumerate(cameras if options.intrinsics is None else []):
         try:
-            own[k] = _pincam(path or folder / "lowres_wide_intrinsics" / f"{times[k]}.pincam", size)
+            own[k] = _pincam(
+                path or folder / "lowres_wide_intrinsics" / f"{colours[k].stem}.pincam", size
+            )
         except BadFrameError as error:
             faults.setdefault(k, str(error))
 

@@ -1,26 +1,25 @@
 """Habitat: meshes (HM3D's GLB files) and episodes (``.json.gz``); images are rendered.
 
 An episode has ``scene_id``, ``start_position`` (y up), ``start_rotation`` (quaternion xyzw, forward
-is −z) and perhaps ``reference_path`` or ``goals``. The agent starts there and walks by turns and
-steps along the reference path, or else along the shortest path to the first goal. y is turned to z.
+is −z) and perhaps ``reference_path`` or ``goals``; files of object navigation have the goals of
+each category once. The agent starts there and walks by turns and steps along the reference path, or
+else along the shortest path to the first goal. y is turned to z.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-import gzip
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from pewm_jax.config import UserError
 from pewm_jax.data import navigation
 from pewm_jax.data.episodes import SATURATED
-from pewm_jax.data.formats.habitat_walk import walk
+from pewm_jax.data.formats.habitat_walk import NoWayError, read_episodes, walk
 from pewm_jax.data.formats.options import ImportConfig
 from pewm_jax.data.formats.reader import Entry, Format, Load, Picture, RawSequence
 from pewm_jax.data.render import render
@@ -62,25 +61,35 @@ class Habitat(Format):
             raise UserError(f"{src} is not a folder; give the folder of the meshes.")
         meshes = sorted(src.rglob("*.glb"), key=lambda path: (".basis." in path.name, path))
         files = [where] if where.is_file() else sorted(where.rglob("*.json.gz"))
-        episodes = [one for path in files for one in _episodes(path)]
+        episodes = [one for path in files for one in read_episodes(path)]
         if not episodes:
             raise UserError(
                 f"{where} has no episodes; give a .json.gz file of Habitat with --episodes."
             )
-        world = _World(options)
-        found = []
+        found, lost = [], []
         for k, episode in enumerate(episodes):
             mesh = _mesh_of(str(episode.get("scene_id", "")), meshes, src)
             what = f"episode {episode.get('episode_id', k)} of {mesh.name}"
-            path = walk(episode, options, functools.partial(_grid, mesh), what)
-            name = f"{_stem(mesh)}/{episode.get('episode_id', k)}"
-            found.append(Entry(name, len(path), functools.partial(world.open, mesh, path)))
-        return found
+            try:
+                path = walk(episode, options, functools.partial(_grid, mesh), what)
+            except NoWayError as error:
+                lost.append(str(error))
+                continue
+            found.append((f"{_stem(mesh)}/{episode.get('episode_id', k)}", mesh, path))
+        if not found:
+            raise UserError(f"{lost[0]}, and no other episode can be walked; check the meshes.")
+        note = f"{len(lost)} of {len(episodes)} episodes are left out; first: " + "".join(lost[:1])
+        world = _World(options, note if lost else "")
+        return [
+            Entry(name, len(path), functools.partial(world.open, mesh, path))
+            for name, mesh, path in found
+        ]
 
 
 @dataclasses.dataclass(frozen=True)
 class _World:
     options: ImportConfig
+    note: str
 
     def open(self, mesh: Path, pose_T44: np.ndarray) -> RawSequence:
         """Return the frames along poses, which are rendered when they are read."""
@@ -102,7 +111,9 @@ class _World:
         info = {"step_m": self.options.step, "turn_deg": self.options.turn_deg}
         label = f"{mesh}, frame"
         return RawSequence(
-            pose_T44, intrinsics, size, read, lambda k: f"{label} {k}", scale, info=info
+            *(pose_T44, intrinsics, size, read, lambda k: f"{label} {k}", scale),
+            info=info,
+            note=self.note,
         )
 
 
@@ -112,18 +123,8 @@ def _scene(mesh: Path) -> Scene:
 
 
 @functools.lru_cache(maxsize=4)
-def _grid(mesh: Path) -> navigation.NavGrid:
-    return navigation.navigable(_scene(mesh), agent_radius_m=RADIUS_M)
-
-
-def _episodes(path: Path) -> list[dict[str, Any]]:
-    """Read one file of episodes; a file that only refers to others has none."""
-    try:
-        with gzip.open(path, "rt", encoding="utf-8") as file:
-            found = json.load(file)["episodes"]
-    except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
-        raise UserError(f"{path} cannot be read as episodes of Habitat ({error!r}).") from None
-    return [one for one in found if isinstance(one, dict)]
+def _grid(mesh: Path, near_z: float | None) -> navigation.NavGrid:
+    return navigation.navigable(_scene(mesh), agent_radius_m=RADIUS_M, near_z=near_z)
 
 
 def _stem(mesh: Path) -> str:

@@ -31,6 +31,7 @@ from pewm_jax.io import pickles
 from pewm_jax.registry import register
 
 FILE = "traj_data.pkl"
+REMEDY = "only arrays of numbers are read, position and yaw: copy it again, or write them alone"
 METRES_PER_STEP = {"recon": 0.25, "scand": 0.38, "tartan": 0.72, "sacson": 0.255, "huron": 0.255}
 """Words in a data set's name → length of a step of its robot, metres."""
 
@@ -51,7 +52,7 @@ class NoMaD(FolderFormat):
 
     def entry(self, folder: Path, options: ImportConfig) -> Entry:
         """Return one trajectory; its frames are those that have both an image and a position."""
-        table = pickles.read(folder / FILE)
+        table = pickles.read(folder / FILE, REMEDY)
         position, yaw = (np.asarray(table.get(k, np.empty(0)), float) for k in ("position", "yaw"))
         yaw = yaw.reshape(-1)
         if position.ndim != 2 or position.shape[1] < 2 or len(position) != len(yaw):

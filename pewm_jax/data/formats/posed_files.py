@@ -120,6 +120,26 @@ class PosedFiles:
         return found
 
 
+def paired(
+    frames: np.ndarray, table: dict[str, np.ndarray], seen: Sequence[int], tail: int
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the frames that have images or a row of ``table``, in order, and their rows.
+
+    Frames that are seen and have no row get one that is not a number. Up to ``tail`` frames at the
+    end that have only one of both are left out.
+    """
+    lost, last = np.setdiff1d(seen, frames), frames.max(initial=-1)
+    if (lost > last).sum() <= tail:
+        lost = lost[lost < last]
+    unseen = frames > max(seen, default=-1)
+    kept = ~unseen if unseen.sum() <= tail else np.ones(len(frames), bool)
+    together = np.append(frames[kept], lost)
+    order = np.argsort(together, kind="stable")
+    gaps = np.full(len(lost), np.nan)
+    rows = {name: np.append(column[kept], gaps)[order] for name, column in table.items()}
+    return together[order].astype(int), rows
+
+
 def by_time(folder: Path, end: str) -> dict[float, Path]:
     """Return files by the time in their names, ``SCAN_TIME.png``."""
     found = {}

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from pewm_jax.config import UserError
 from pewm_jax.data.formats import video
 from pewm_jax.data.formats.options import ImportConfig
-from pewm_jax.data.formats.posed_files import Files
+from pewm_jax.data.formats.posed_files import Files, paired
 from pewm_jax.data.formats.reader import (
     BadFrameError,
     Entry,
@@ -36,6 +36,7 @@ from pewm_jax.data.formats.reader import (
 from pewm_jax.registry import register
 
 COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
+FOCAL = ("fx", "fy", "cx", "cy")
 TAIL = 2
 """Frames at the end of a recording that may lack their counterpart."""
 
@@ -63,12 +64,10 @@ class Stray(FolderFormat):
         depths = Files("depth images", folder / "depth", "", (".png", ".npy"))
         times = video.frame_times(folder / "rgb.mp4")
         frames = table.get("frame", np.arange(len(table["x"]))).astype(int)
-        last = max(depths.names, default=-1)
-        cut = int(((frames > last) | (frames >= len(times))).sum())
-        count = len(frames) - cut if cut <= TAIL else len(frames)
-        table = {name: column[:count] for name, column in table.items()}
-        seen = _Recording(folder, options, table, frames[:count], depths, times)
-        return Entry(folder.resolve().name, count, seen.open)
+        seen = [k for k in depths.names if k < len(times)]
+        frames, table = paired(frames, table, seen, TAIL)
+        recording = _Recording(folder, options, table, frames, depths, times)
+        return Entry(folder.resolve().name, len(frames), recording.open)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,8 +82,10 @@ class _Recording:
     def open(self) -> RawSequence:
         """Return the sequence."""
         path = self.folder / "rgb.mp4"
-        counts = f"{len(self.times)} frames in rgb.mp4, {len(self.depths.names)} depth images"
-        counts = f"there are {counts}, {len(self.frames)} poses"
+        counts = (
+            f"{len(self.depths.names)} depth images, {np.isfinite(self.table['x']).sum()} poses"
+        )
+        counts = f"there are {len(self.times)} frames in rgb.mp4, {counts}"
         faults = {}
         for k, number in enumerate(self.frames):
             if number >= len(self.times):
@@ -98,11 +99,11 @@ class _Recording:
         pose[known, :3, :3] = Rotation.from_quat(rows[known, 3:]).as_matrix()
         pose[known, :3, 3] = rows[known, :3]
         own = None
-        if {"fx", "fy", "cx", "cy"} <= self.table.keys() and self.options.intrinsics is None:
-            own = np.stack([self.table[name] for name in ("fx", "fy", "cx", "cy")], -1)
+        if set(FOCAL) <= self.table.keys() and self.options.intrinsics is None:
+            own = np.stack([self.table[name] for name in FOCAL], -1)
         return RawSequence(
             pose,
-            np.median(own, 0) if own is not None else self._matrix(),
+            np.nanmedian(own, 0) if own is not None else self._matrix(),
             video.video_size(path),
             functools.partial(self._read, own),
             lambda k: f"{path}, frame {self.frames[k]}",
