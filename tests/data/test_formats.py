@@ -14,6 +14,7 @@ import pytest
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import formats
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.formats.lerobot_features import Features
 from pewm_jax.data.importer import ImportConfig, import_recording
 from tests.data import layouts
 from tests.data.two_rooms import box_views
@@ -167,6 +168,25 @@ def test_a_lerobot_set_keeps_its_episodes_actions_and_tasks(tmp_path):
     (only,), _ = imported(src, tmp_path / "one", "lerobot", names=names, stride=2)
     np.testing.assert_array_equal(only.actions[0], [1, 0, 1, 1])  # both actions of two steps
     assert only.length == 6
+
+
+def test_the_pose_of_a_lerobot_set_is_that_of_its_camera(tmp_path):
+    images, shape = {"dtype": "video", "shape": [48, 64, 3]}, {"dtype": "float32", "shape": [7]}
+    cameras = [f"observation.images.{name}" for name in ("top", "front", "front_left")]
+    poses = ["action.camera_pose", "observation.ee_pose", "observation.front_left_camera_pose"]
+
+    def pose(*names, camera="front"):
+        features = dict.fromkeys(cameras, images) | dict.fromkeys(names, shape)
+        about = {"codebase_version": "v3.0", "fps": 10, "features": features}
+        (tmp_path / "meta").mkdir(exist_ok=True)
+        (tmp_path / "meta/info.json").write_text(json.dumps(about))
+        return Features(tmp_path).pose(None, f"observation.images.{camera}")
+
+    assert pose(*poses) is None
+    assert pose(*poses, camera="front_left") == poses[-1]
+    assert pose(*poses, "observation.camera_pose") == "observation.camera_pose"
+    assert pose("observation.pose", "observation.front_cam_pose") == "observation.front_cam_pose"
+    assert pose("observation.pose", camera="top") == "observation.pose"
 
 
 def test_a_lerobot_set_without_depth_and_pose_says_what_it_is_good_for(tmp_path):

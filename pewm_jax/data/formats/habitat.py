@@ -25,6 +25,7 @@ from pewm_jax.data.formats.reader import Entry, Format, Load, Picture, RawSequen
 from pewm_jax.data.render import render
 from pewm_jax.data.scenes import Scene, load_scene
 from pewm_jax.geometry.cameras import intrinsics_from_fov
+from pewm_jax.io.progress import Meter
 from pewm_jax.registry import register
 from pewm_jax.types import Camera
 
@@ -67,15 +68,17 @@ class Habitat(Format):
                 f"{where} has no episodes; give a .json.gz file of Habitat with --episodes."
             )
         found, lost = [], []
-        for k, episode in enumerate(episodes):
-            mesh = _mesh_of(str(episode.get("scene_id", "")), meshes, src)
-            what = f"episode {episode.get('episode_id', k)} of {mesh.name}"
-            try:
-                path = walk(episode, options, functools.partial(_grid, mesh), what)
-            except NoWayError as error:
-                lost.append(str(error))
-                continue
-            found.append((f"{_stem(mesh)}/{episode.get('episode_id', k)}", mesh, path))
+        with Meter("searching paths", len(episodes), "episodes") as meter:
+            for k, episode in enumerate(episodes):
+                mesh = _mesh_of(str(episode.get("scene_id", "")), meshes, src)
+                number = episode.get("episode_id", k)
+                grids = functools.partial(_grid, mesh)
+                try:
+                    path = walk(episode, options, grids, f"episode {number} of {mesh.name}")
+                    found.append((f"{_stem(mesh)}/{number}", mesh, path))
+                except NoWayError as error:
+                    lost.append(str(error))
+                meter.advance(1)
         if not found:
             raise UserError(f"{lost[0]}, and no other episode can be walked; check the meshes.")
         note = f"{len(lost)} of {len(episodes)} episodes are left out; first: " + "".join(lost[:1])
@@ -138,6 +141,6 @@ def _mesh_of(scene_id: str, meshes: list[Path], src: Path) -> Path:
     if not found:
         raise UserError(
             f"{src} has no mesh {wanted}.glb or {wanted}.basis.glb, which an episode names: put it "
-            "below this folder."
+            "below this folder, or give the episodes of other meshes with --episodes."
         )
     return found[0]

@@ -69,8 +69,8 @@ class _Cameras:
     def __post_init__(self) -> None:
         self.colour = self.meta.camera(self.options.camera)
         self.depth = self.meta.depth_of(self.colour)
-        self.pose = self.meta.pose(self.options.pose)
-        self.intrinsics = self.meta.intrinsics()
+        self.pose = self.meta.pose(self.options.pose, self.colour)
+        self.intrinsics = self.meta.intrinsics(self.colour)
 
     def open(self, row: Row) -> RawSequence:
         """Return the sequence of one episode."""

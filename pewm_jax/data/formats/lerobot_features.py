@@ -72,11 +72,11 @@ class Features:
         """Return the feature of a camera's depth: of the same name, or the only one of all."""
         known, only = self._images(depth=True), len(self._images(depth=False)) == 1
         name = camera.rpartition(".")[2]
-        named = [key for key in known if name in key.rpartition(".")[2]]
+        named = [key for key in known if self._owner(key) == name]
         return next(iter(named or (known if only else [])), None)
 
-    def pose(self, wanted: str | None) -> str | None:
-        """Return the feature of the camera's pose, None if no name tells one."""
+    def pose(self, wanted: str | None, camera: str) -> str | None:
+        """Return the feature of a camera's pose, None if no name tells one."""
         if wanted is not None:
             if wanted not in self.features:
                 raise ConfigError(
@@ -85,17 +85,28 @@ class Features:
                 )
             return wanted
         for end in POSES:
-            for key, own in self.features.items():
-                if key.endswith(end) and math.prod(own.get("shape") or [0]) in (7, 12, 16):
-                    return key
+            found = self._belonging(camera, [k for k in self._sized(7, 12, 16) if _ends(k, end)])
+            if found:
+                return found
         return None
 
-    def intrinsics(self) -> str | None:
-        """Return the feature of the camera's intrinsics, 4 numbers or a matrix; or None."""
-        for key, own in self.features.items():
-            if "intrinsics" in key and math.prod(own.get("shape") or [0]) in (4, 9):
-                return key
-        return None
+    def intrinsics(self, camera: str) -> str | None:
+        """Return the feature of a camera's intrinsics, 4 numbers or a matrix; or None."""
+        return self._belonging(camera, [k for k in self._sized(4, 9) if "intrinsics" in k])
+
+    def _sized(self, *sizes: int) -> list[str]:
+        own = self.features.items()
+        return [key for key, about in own if math.prod(about.get("shape") or [0]) in sizes]
+
+    def _belonging(self, camera: str, keys: list[str]) -> str | None:
+        """Return the key that has the camera's name in it, else one without another camera's."""
+        own = [key for key in keys if self._owner(key) == camera.rpartition(".")[2]]
+        return next(iter(own or [key for key in keys if not self._owner(key)]), None)
+
+    def _owner(self, key: str) -> str:
+        """Return the longest name of a camera that is in a feature's name, empty if none is."""
+        names = [camera.rpartition(".")[2] for camera in self._images(depth=False)]
+        return max((name for name in names if name in key.rpartition(".")[2]), key=len, default="")
 
     def fixed_intrinsics(self, camera: str) -> np.ndarray | None:
         """Return intrinsics that ``info.json`` has for a camera, or None."""
@@ -152,3 +163,10 @@ def poses_of(values: np.ndarray, name: str) -> np.ndarray:
             "row), 7 (xyz, quaternion xyzw) or 3 (x, y, yaw)."
         )
     return pose
+
+
+def _ends(key: str, end: str) -> bool:
+    """Tell whether a feature is named as a camera's pose; ``ee_pose`` and actions are others."""
+    last = key.rpartition(".")[2]
+    fits = last.endswith(end) if end != "pose" or "cam" in last else last == end
+    return fits and not key.startswith("action")
