@@ -307,7 +307,7 @@ def test_a_world_with_a_module_of_functions_goes_on_working_with_a_warning():
     assert params["kernel"].shape == (4,)
     assert [stage.name for stage in worlds.stages(model)] == ["fit"]
     assert model.start(params, frames).map is params["kernel"]
-    assert worlds.sharding(model)[0][0] == ".*"
+    assert worlds.sharding(model)[-1][0] == ".*"
 
 
 def test_a_module_that_is_reloaded_registers_anew(tmp_path, monkeypatch):

@@ -238,8 +238,8 @@ def publish(run: Path, stage: Stage, step: int, params: Params) -> Path:
     if processes.is_primary():
         for partial in run.glob(f"{WEIGHTS}.*partial"):
             atomic.remove(partial)  # left by a killed process
-        config = configuration.load(run / CONFIG)
-        weights.save(path, params, _metadata(stage, step) | lora.reference(config))
+        base = lora.reference(configuration.load(run / CONFIG)) if stage.stored else {}
+        weights.save(path, params, _metadata(stage, step) | base)
     return path
 
 

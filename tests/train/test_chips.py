@@ -41,7 +41,9 @@ def test_others_are_not_taken_for_one_of_them(text):
 
 
 def test_an_unknown_chip_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match="a100, h100, h200, b200, v4, v5e, v5p, v6e, tpu7x"):
+    with pytest.raises(
+        ConfigError, match="a100, rtx4090, h100, h200, b200, v4, v5e, v5p, v6e, tpu7x"
+    ):
         chips.named("h900")
 
 
