@@ -50,8 +50,8 @@ class SceneZoo(reader.Format):
         try:
             data, source = _opened(options)
         except ImportError as error:  # the package, or a library that Open3D needs
-            needed = "the format scenezoo needs SceneZoo: run `pip install 'pewm-jax[scenes]'`"
-            raise UserError(f"{needed} ({_sentence(error)}).") from None
+            how = "`pip install 'pewm-jax[scenes]'` installs it; docs/data.md lists what it needs"
+            raise UserError(f"SceneZoo cannot be loaded ({_sentence(error)}): {how}.") from None
         folders = (path.name for end in ("*/", "*/*/", "*/*/*/") for path in options.src.glob(end))
         found, reasons = [], []
         for name in sorted(set(folders)):
