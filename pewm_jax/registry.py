@@ -121,6 +121,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "open3d": "pewm_jax.data.formats.recording:Open3D",
         "replica": "pewm_jax.data.formats.replica:Replica",
         "scannet": "pewm_jax.data.formats.scannet:ScanNet",
+        "scenezoo": "pewm_jax.data.formats.scene_zoo:SceneZoo",
         "stray": "pewm_jax.data.formats.stray:Stray",
         "tum": "pewm_jax.data.formats.recording:TUM",
     },

@@ -273,7 +273,7 @@ def test_every_format_is_recognised_and_nothing_is_not(tmp_path):
     with pytest.raises(UserError, match="is not a folder"):
         formats.recognise(tmp_path / "nowhere")
     assert formats.names()[0] == "auto"
-    assert len(formats.names()) == 11
+    assert len(formats.names()) == 12
     for name in formats.names()[1:]:
         found = formats.named(name)
         assert name == found.NAME

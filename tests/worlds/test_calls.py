@@ -92,7 +92,7 @@ def calls(kind):
     return found
 
 
-@pytest.mark.slow(but=("pewm", "egowm"))
+@pytest.mark.slow(but="pewm")
 @EVERY_WORLD
 def test_a_second_eager_call_compiles_nothing(kind):
     for name, call in calls(kind).items():
@@ -127,7 +127,7 @@ def test_many_eager_calls_keep_nothing():
     assert after[2] - before[2] < 40
 
 
-@pytest.mark.slow(but=("pewm", "egowm"))
+@pytest.mark.slow(but="pewm")
 @EVERY_WORLD
 def test_eager_and_jitted_calls_are_the_same_program(kind):
     model, params, state = made(kind)
@@ -199,6 +199,7 @@ def arguments(who):
     return function, {"model": MODELS["pewm"], "params": params} | given
 
 
+@pytest.mark.slow(only="persist")
 @pytest.mark.parametrize("who", ["start", "observe", "imagine", "imagine_many"])
 @pytest.mark.parametrize(
     ("argument", "value", "says"),

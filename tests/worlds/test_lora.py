@@ -89,6 +89,7 @@ def both(name, stage_name):
     return config, known[number], lora.adapt(config, known)[number]
 
 
+@pytest.mark.slow(only="stage2")
 @pytest.mark.parametrize(("name", "stage_name"), CASES)
 def test_loss_and_gradient_are_those_of_the_sums(name, stage_name):
     config, plain, adapted = both(name, stage_name)
@@ -154,6 +155,7 @@ def test_only_what_an_asked_stage_trains_is_adapted():
     assert {path.split("/")[1] for path in alone.stored} == {"memory"}
 
 
+@pytest.mark.slow(but="int8")
 @pytest.mark.parametrize("precision", ["int8", "fp8"])
 def test_quantized_weights_imagine_nearly_the_same(precision):
     config = experiments()["cogvideox"]

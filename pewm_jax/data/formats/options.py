@@ -15,7 +15,7 @@ from pewm_jax.data.episodes import DEPTH_LIMIT_M
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 OF_FORMATS = (
     *("depth_scale", "trajectory", "camera", "pose", "metres_per_step", "min_confidence"),
-    *("episodes", "fov", "camera_height", "frames", "step", "turn_deg"),
+    *("episodes", "fov", "camera_height", "frames", "step", "turn_deg", "dataset"),
 )
 """Options that only some formats use; a format names those that it uses."""
 
@@ -25,8 +25,8 @@ class ImportConfig:
     """Import recordings of a format, or find out the format: auto.
 
     FORMAT SRC OUT: the format is the first argument, or --format. The formats are open3d, tum,
-    lerobot, nomad, 7scenes, replica, scannet, arkitscenes, stray, habitat, and those of plugins. An
-    import that was interrupted is resumed by the same command.
+    lerobot, nomad, 7scenes, replica, scannet, arkitscenes, stray, habitat, scenezoo, and those of
+    plugins. An import that was interrupted is resumed by the same command.
     """
 
     src: Annotated[Path, tyro.conf.Positional]
@@ -70,7 +70,8 @@ class ImportConfig:
     """Text file with the name of a sequence per line: only these are imported, such as
     traj_names.txt of NoMaD."""
     camera: str | None = None
-    """LeRobot: feature of the colour images; by default the first camera."""
+    """LeRobot: feature of the colour images; by default the first camera. SceneZoo: source of
+    frames, such as iphone; by default the first with a pinhole camera."""
     pose: str | None = None
     """LeRobot: feature of the camera's pose in the world: 16, 12 or 7 numbers (xyz, quaternion
     xyzw), or 3 (x, y, yaw)."""
@@ -91,6 +92,8 @@ class ImportConfig:
     """Habitat: length of a step, metres."""
     turn_deg: float = 30.0
     """Habitat: angle of a turn, degrees."""
+    dataset: str | None = None
+    """SceneZoo: name of the data set, such as scannetv2, scannetppv2, multiscan or 3rscan."""
     episode_frames: int = 500
     """A longer sequence is cut into episodes of at most this many frames."""
     skip_bad: int = 0
