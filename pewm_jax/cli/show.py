@@ -18,7 +18,7 @@ class Settings:
     """Imagine along a recorded episode, and write the frames and the map for other tools.
 
     The model observes some frames of the episode, then imagines the following ones with the
-    recorded actions (or cameras, if the episode has no actions).
+    recorded actions (or cameras, if the episode has no actions that the model takes).
     """
 
     run: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
@@ -120,6 +120,7 @@ def _imagined(settings: Settings, opened: Any) -> Imagined:
     from pewm_jax.codecs.signals import rgb_from_signal
     from pewm_jax.data.dataset import EpisodeSource
     from pewm_jax.data.loader import require_same_cells
+    from pewm_jax.eval.clips import recorded_control, steered_by_record
     from pewm_jax.geometry.actions import PLANAR
     from pewm_jax.types import Frames
     from pewm_jax.worlds.rollouts import rollout
@@ -144,7 +145,9 @@ def _imagined(settings: Settings, opened: Any) -> Imagined:
     observed, true = episode.frames(range(settings.context)), episode.frames(after)
     planar = episode.actions is not None and episode.actions.shape[1] == PLANAR
     control: Any = true.camera
-    if planar and episode.actions is not None:
+    if steered_by_record(config.model):
+        control = recorded_control(config.model, episode, range(first, first + 1 + count))
+    elif planar and episode.actions is not None:
         control = episode.actions[first : first + count]
     print(f"imagining {count} frames …", flush=True)
     state = worlds.start(config, params, observed)

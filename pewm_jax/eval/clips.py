@@ -17,11 +17,11 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from pewm_jax.config import Config, UserError, to_dict
-from pewm_jax.data.clips import choose_context
+from pewm_jax.config import Config, UserError, World, to_dict
+from pewm_jax.data.clips import choose_context, join_actions
 from pewm_jax.data.episodes import Episode
 from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integrate
-from pewm_jax.types import Array, Camera, Frames
+from pewm_jax.types import Array, Camera, Control, Frames
 
 VERSION = 2
 """Increase it whenever the same settings would give different scores."""
@@ -143,18 +143,72 @@ def needs_cameras(episodes: Sequence[Episode], choices: Sequence[ClipChoice]) ->
     return False
 
 
+def steered_by_record(model: World) -> bool:
+    """Return whether only recorded actions can drive a world, because they are not planar."""
+    return model.batch_spec.actions not in (0, PLANAR)
+
+
+def recorded_control(model: World, episode: Episode, frames: Sequence[int]) -> Control:
+    """Return the recorded control that leads from the first frame through the N others.
+
+    It has (N,) cameras and (N, A) actions, composed as in training; frames are evenly spaced.
+
+    Raises:
+        UserError: the episode has no actions, or of another number than the model's.
+    """
+    wanted = model.batch_spec.actions
+    if episode.actions is None:
+        raise UserError(
+            f"episode {episode.name} has no actions, and this model is steered by actions of "
+            f"{wanted} numbers: import the data with their actions."
+        )
+    actions = join_actions(episode.actions, np.asarray(frames))
+    if actions.shape[1] != wanted:
+        stride = int(frames[1] - frames[0])
+        over = f" over {stride} frames" if stride > 1 else ""
+        raise UserError(
+            f"episode {episode.name} has actions of {actions.shape[1]} numbers{over}, and this "
+            f"model is steered by {wanted}: use the data and the stride (evaluate.stride) that it "
+            "was trained with."
+        )
+    return Control(episode.camera(np.asarray(frames[1:])), actions)
+
+
+def has_geometry(episode: Episode) -> bool:
+    """Return whether points of an episode can be located: it has depth and camera poses."""
+    return episode.has_depth and has_poses(episode)
+
+
+def has_poses(episode: Episode) -> bool:
+    """Return whether the camera poses of an episode are known."""
+    return episode.info.get("poses") != "unknown"
+
+
+def lacking_geometry(episodes: Sequence[Episode]) -> str:
+    """Return a sentence if some episodes lack depth or poses, with what is not measured; or ""."""
+    if all(has_geometry(episodes[index]) for index in range(len(episodes))):
+        return ""
+    return (
+        "The data lack depth or camera poses, so there is no reprojection, and no scores over "
+        "pixels seen before and never seen."
+    )
+
+
 def load_clip(
     config: Config, episodes: Sequence[Episode], choice: ClipChoice, *, cameras: bool = False
-) -> tuple[Frames, Frames, Array | Camera]:
+) -> tuple[Frames, Frames, Array | Camera | Control]:
     """Read one chosen clip: S context frames, N ground-truth frames, and the control.
 
     The control leads from the present through the N frames: (N, 3) actions composed from the
-    recorded poses, or with ``cameras`` (``needs_cameras``) the (N,) recorded cameras. Padding
-    frames of the context have depth 0 (not measured) everywhere.
+    recorded poses, or with ``cameras`` (``needs_cameras``) the (N,) recorded cameras. If the
+    world's actions are not planar, it is ``recorded_control``; if they are and the poses are
+    unknown, the (N, 3) recorded actions. Padding frames of the context have depth 0 (not measured)
+    everywhere.
 
     Raises:
         UserError: the recorded actions or the planar motion of the poses do not lead to the
-            recorded poses, or the frames have another size than the model's.
+            recorded poses, the frames have another size than the model's, or the episode lacks the
+            actions that steer the model.
     """
     episode = episodes[choice.episode]
     context = episode.frames(list(choice.context_S))
@@ -169,6 +223,11 @@ def load_clip(
             f"episode {choice.name} has frames of {height}×{width} and this model was trained on "
             f"{size[0]}×{size[1]}: collect or import the data at the model's size."
         )
+    frames = (choice.start, *choice.targets_N)
+    if steered_by_record(config.model):
+        return context, targets, recorded_control(config.model, episode, frames)
+    if config.model.batch_spec.actions and not has_poses(episode):
+        return context, targets, recorded_control(config.model, episode, frames).actions_TA
     if cameras:
         return context, targets, targets.camera
     poses = np.concatenate(

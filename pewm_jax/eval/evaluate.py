@@ -16,7 +16,7 @@ from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.data.loader import require_recorded
 from pewm_jax.eval import loaded_run as runs
 from pewm_jax.eval import reproject, results, steering
-from pewm_jax.eval.clips import ClipChoice, fingerprint
+from pewm_jax.eval.clips import ClipChoice, fingerprint, lacking_geometry, steered_by_record
 from pewm_jax.eval.gallery import make_gallery
 from pewm_jax.eval.long_rollouts import LongRollouts, roll_long
 from pewm_jax.eval.metrics.selection import ReportMetrics, select_metrics
@@ -125,7 +125,9 @@ def evaluate(
     )
     if job.metrics.lpips is None:
         log(job.metrics.about["lpips"])
-    choice = workers().first_alone(lambda: choose_settings(config, cache, log), "reprojection")
+    choice = workers().first_alone(
+        lambda: choose_settings(config, cache, log, job.lacking), "reprojection"
+    )
     log(f"reprojection: {choice.why}")
     protocol, clips, rollouts = resolve_clips(config, job.episodes, job.protocol, str(job.split))
     log(f"protocol {protocol.sha256[:12]}: {len(clips)} clips, {len(rollouts)} long rollouts")
@@ -148,7 +150,10 @@ def evaluate(
 
 @dataclasses.dataclass(frozen=True)
 class _Job:
-    """The inputs and settings of an evaluation; ``config`` has the overrides and the protocol's."""
+    """The inputs and settings of an evaluation; ``config`` has the overrides and the protocol's.
+
+    ``lacking`` says which scores the data do not allow, "" if they have depth and poses.
+    """
 
     loaded: runs.LoadedRun
     has_memory: bool
@@ -159,6 +164,7 @@ class _Job:
     metrics: ReportMetrics
     validation_hash: str
     data_hash: str
+    lacking: str
 
     @property
     def split(self) -> Path:
@@ -200,7 +206,8 @@ def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
     validation = reproject.data_hash(config)
     loaded = runs.with_precision(loaded, config.evaluate.quantize)
     return _Job(
-        loaded, has_memory, none, config, protocol, episodes, metrics, validation, data_hash
+        *(loaded, has_memory, none, config, protocol, episodes, metrics, validation, data_hash),
+        lacking=lacking_geometry(episodes),
     )
 
 
@@ -216,7 +223,8 @@ def _methods(
 
     model = runner(job.loaded, job.config)
     none = runner(job.none, job.none.config) if job.none else None
-    return Methods(model, choice.settings, none, job.none_weights, job.has_memory)
+    settings = None if job.lacking else choice.settings
+    return Methods(model, settings, none, job.none_weights, job.has_memory)
 
 
 class _Measured(NamedTuple):
@@ -263,8 +271,13 @@ def _metrics(
     metrics = compute_metrics(job.config, *measured[:3], i3d, consistency)
     metrics["coverage"] = measured.coverage
     metrics["steering"] = measured.steered and measured.steered.facts()
-    if protocol.control == "cameras":
+    wanted = job.config.model.batch_spec.actions
+    if steered_by_record(job.config.model):
+        metrics["protocol"]["motion"] = f"the recorded actions of {wanted} numbers"
+    elif protocol.control == "cameras":
         metrics["protocol"]["motion"] = "the recorded cameras, in six degrees of freedom"
+    if job.lacking:
+        metrics["protocol"] |= {"seen": None, "seen_share": None, "geometry": job.lacking}
     trained_on = Path(job.loaded.config.data.path) / TRAINED_ON
     metrics["protocol"] |= held_out(metrics["protocol"]["scene_names"], trained_on) | {
         "reproject": choice.facts(),

@@ -10,7 +10,7 @@ import numpy as np
 
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval.clips import ClipChoice, load_clip
+from pewm_jax.eval.clips import ClipChoice, has_geometry, load_clip
 from pewm_jax.eval.long_rollouts import LongRollouts
 from pewm_jax.eval.metrics.images import TOLERANCE_M, TOLERANCE_RELATIVE, seen_masks
 from pewm_jax.geometry.actions import heading
@@ -113,11 +113,13 @@ def _gather(
 ) -> _Rollout:
     choice = long.scored.choices[index]
     context, truth, _ = load_clip(config, episodes, choice, cameras=True)
-    seen, _ = seen_masks(truth, context)
+    seen = np.zeros(truth.depth_THW.shape, bool)
+    if has_geometry(episodes[choice.episode]):
+        seen = np.asarray(seen_masks(truth, context)[0])
     made = {"truth": (truth.rgb_THWC, truth.depth_THW)}
     made |= {name: (kept["rgb"][index], kept["depth"][index]) for name, kept in long.kept.items()}
     frames = {name: after_present(context, *made[name]) for name in CAPTIONS if name in made}
-    return _Rollout(choice, context, truth, np.asarray(seen), frames)
+    return _Rollout(choice, context, truth, seen, frames)
 
 
 def _enlarge_mask(mask_HW: np.ndarray, width: int) -> np.ndarray:

@@ -21,7 +21,7 @@ import numpy as np
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import statistics
-from pewm_jax.eval.clips import ClipChoice, load_clip, stack
+from pewm_jax.eval.clips import ClipChoice, load_clip, stack, steered_by_record
 from pewm_jax.eval.metrics import Revisit
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.metrics.revisits import ways
@@ -76,6 +76,11 @@ def way_out(config: Config, rollouts: Sequence[ClipChoice]) -> tuple[int, str]:
     asked, there = config.evaluate.mirror, len(rollouts[0].targets_N)
     if asked == 0:
         return 0, "The mirror test is disabled (evaluate.mirror)."
+    if steered_by_record(config.model):
+        return 0, (
+            f"The mirror test is skipped: actions of {config.model.batch_spec.actions} numbers "
+            "have no known reverse."
+        )
     if asked < 0 and there < LONG:
         return 0, (
             f"The mirror test is skipped: long rollouts have {there} frames, fewer than {LONG}; "

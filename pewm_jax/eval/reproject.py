@@ -157,15 +157,17 @@ def data_hash(config: Config) -> str:
 
 
 def choose_settings(
-    config: Config, cache: ResultCache, log: Callable[[str], Any]
+    config: Config, cache: ResultCache, log: Callable[[str], Any], lacking: str = ""
 ) -> ReprojectChoice:
     """Try all candidates on the data set's validation split and choose the best.
 
     Clips are cut as in training, the same at every call: one from each episode, then a second one,
     and so on. Scores are stored in ``cache``. Without a validation split whose clips fit the model,
-    the default settings are used.
+    the default settings are used. ``lacking`` says why nothing can be reprojected, if so.
     """
     folder, data = Path(config.data.path) / SPLIT, data_hash(config)
+    if lacking:
+        return ReprojectChoice(ReprojectSettings(), {}, 0, lacking, data)
     try:
         episodes = EpisodeSource(folder)
 

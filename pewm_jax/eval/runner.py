@@ -28,11 +28,12 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import abstract
+from pewm_jax.eval.clips import steered_by_record
 from pewm_jax.eval.reproject import ReprojectSettings, reproject_batch
 from pewm_jax.io.store import Workers
 from pewm_jax.report.labels import OWN_METHODS
 from pewm_jax.train import processes
-from pewm_jax.types import Array, Camera, Frames, Params, WorldState
+from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import start
 from pewm_jax.worlds.rollouts import rollout
 
@@ -59,7 +60,8 @@ class ModelRunner:
         params: weights.
         batch: number of clips sampled at once.
         context: number of observed frames from which a state is started.
-        cameras: whether clips are driven by cameras (six degrees of freedom) instead of actions.
+        cameras: whether clips are driven by cameras (six degrees of freedom) instead of planar
+            actions; a world whose actions are not planar is driven by both, as recorded.
         devices: devices of this process, over which a batch is split, as many of them as divide it;
             by default one.
         log: prints what is being compiled, and how long it took.
@@ -99,7 +101,10 @@ class ModelRunner:
         steps = self.config.model.sample_steps
         steps = f"{steps} steps, " if steps else ""
         control = abstract.array(self.batch, length, 3)
-        if self.cameras:
+        if steered_by_record(self.config.model):
+            actions = abstract.array(self.batch, length, self.config.model.batch_spec.actions)
+            control = Control(abstract.camera(self.batch, length), actions)
+        elif self.cameras:
             control = abstract.camera(self.batch, length)
         keys = jax.eval_shape(clip_keys, jax.ShapeDtypeStruct((self.batch, 2), jnp.uint32))
         for memory in memories:
@@ -123,7 +128,7 @@ class ModelRunner:
     def run(
         self,
         context: Frames,
-        control: Array | Camera,
+        control: Array | Camera | Control,
         seeds_B2: np.ndarray,
         *,
         memory: bool,
@@ -134,8 +139,8 @@ class ModelRunner:
 
         Args:
             context: (B, S) observed frames, the present last, colours uint8.
-            control: from the present frame through the N frames: (B, N, 3) actions, or (B, N)
-                cameras.
+            control: from the present frame through the N frames: (B, N, 3) actions, (B, N)
+                cameras, or both with actions of another kind; see ``clips.load_clip``.
             seeds_B2: sampling seed and clip number; equal values give equal noise, in any batch,
                 with or without the map.
             memory: whether to use the map or an empty one.
@@ -249,10 +254,13 @@ SAMPLED = ("memory", "empty", "model", "none")
 
 @dataclasses.dataclass(frozen=True)
 class Methods:
-    """The methods of one evaluation; ``none`` is a model trained without a memory."""
+    """The methods of one evaluation; ``none`` is a model trained without a memory.
+
+    ``reproject`` is None if the data have no depth or no poses.
+    """
 
     model: ModelRunner
-    reproject: ReprojectSettings
+    reproject: ReprojectSettings | None
     none: ModelRunner | None = None
     none_weights: str = ""
     remembers: bool = True
@@ -262,11 +270,13 @@ class Methods:
         """Return the available methods."""
         left_out = {"model"} if self.remembers else {"memory", "empty"}
         left_out |= {"none"} if self.none is None else set()
+        left_out |= {"reproject"} if self.reproject is None else set()
         return tuple(name for name in METHODS if name not in left_out)
 
     def piece(self, method: str) -> str:
         """Return the method's name in partial results, which includes what its scores depend on."""
-        extra = {"none": self.none_weights[:16], "reproject": self.reproject.name}
+        extra = {"none": self.none_weights[:16]}
+        extra |= {"reproject": self.reproject.name} if self.reproject else {}
         return "-".join(filter(None, (method, extra.get(method))))
 
     def seeds(self, method: str, seeds: tuple[int, ...]) -> tuple[int, ...]:
@@ -285,7 +295,7 @@ class Methods:
         self,
         method: str,
         context: Frames,
-        control: Array | Camera,
+        control: Array | Camera | Control,
         camera: Camera,
         seeds_B2: np.ndarray,
         watch: Callable[[Any], Any] | None = None,
@@ -300,7 +310,7 @@ class Methods:
         """
         if method == "copy":
             return None, None, copy_last(context, camera.intrinsics_4.shape[1])
-        if method == "reproject":
+        if method == "reproject" and self.reproject is not None:
             return None, None, reproject_batch(self.reproject, context, camera)
         given: dict[str, Any] = {} if watch is None else {"watch": watch}
         model = self.none if method == "none" and self.none is not None else self.model

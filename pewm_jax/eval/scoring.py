@@ -18,7 +18,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config, World
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval.clips import ClipChoice, choose, load_clip, stack
+from pewm_jax.eval.clips import ClipChoice, choose, has_poses, load_clip, stack
 from pewm_jax.eval.metrics import LPIPS, VideoDistance
 from pewm_jax.eval.metrics.images import (
     PARTS,
@@ -184,7 +184,13 @@ def load_batch(
     context = stack([part[0] for part in parts], size)
     targets = stack([part[1] for part in parts], size)
     control = stack([part[2] for part in parts], size)
-    seen, unseen = seen_masks_batch(targets, context)
+    located = [has_poses(episodes[choice.episode]) for choice in choices]
+    surfaces = targets
+    if not all(located):  # points without a pose count neither as seen nor as unseen
+        known_B = np.array(located + located[-1:] * (size - len(located)))
+        depth = np.where(known_B[:, None, None, None], targets.depth_THW, 0)
+        surfaces = dataclasses.replace(targets, depth_THW=depth)
+    seen, unseen = seen_masks_batch(surfaces, context)
     tracked = tuple(_tracked(episodes[one.episode], one) for one in choices) if track else ()
     numbers, real = first + np.arange(size), len(choices)
     return Batch(context, targets, control, numbers, seen, unseen, real=real, tracked=tracked)
@@ -257,7 +263,7 @@ def score_table(
     if choices is None:
         choices = choose(config, episodes, config.evaluate.clips, config.evaluate.chain)
     size, starts = config.evaluate.batch, range(0, len(choices), config.evaluate.batch)
-    extras = ["features", *PARTS] if i3d else []
+    extras = ["features", *(PARTS if methods.reproject else ())] if i3d else []
     extras += ["structure"] if structure else []
 
     def work(todo: list[Piece]) -> Iterator[tuple[Piece, dict[str, np.ndarray]]]:

@@ -25,7 +25,14 @@ from pewm_jax import worlds
 from pewm_jax.config import ActionConfig, Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import statistics
-from pewm_jax.eval.clips import ClipChoice, choice_of, load_clip, return_start, stack
+from pewm_jax.eval.clips import (
+    ClipChoice,
+    choice_of,
+    load_clip,
+    return_start,
+    stack,
+    steered_by_record,
+)
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.runner import workers
 from pewm_jax.geometry.actions import actions_between
@@ -270,6 +277,8 @@ def score(
     """
     if not config.model.capabilities.silent_actions:
         return None, None
+    if steered_by_record(config.model):
+        return None, "Steering is not measured: it compares walks, and the actions are not planar."
     among = {choice.episode for choice in choices}
     try:
         walks = choose_walks(config, episodes, len(choices), config.evaluate.chain, among)

@@ -131,12 +131,17 @@ def introduction(protocol: Mapping[str, Any]) -> str:
 
 def _rollouts(gallery: Gallery) -> Section:
     shown = SHOWN["model" if gallery.above is None else "memory"]
+    columns, rest = f"the recording and {shown}", ""
+    if any("reproject" in item for item in gallery.rows):
+        columns = (
+            f"the recording, {shown}, and the reprojection of observed pixels, without a network"
+        )
+        rest = "; the reprojection only shows observed pixels"
     text = (
-        f"From left to right: the recording, {shown}, and the reprojection of observed pixels, "
-        "without a network. Colour above, depth below (bright is near). All start from the same "
-        "observed frame and follow the same actions. After each clip the model continues from "
-        "its own last frame; the reprojection only shows observed pixels. These are the first "
-        "episodes of the split, not selected."
+        f"From left to right: {columns}. Colour above, depth below (bright is near). All start "
+        "from the same observed frame and follow the same actions. After each clip the model "
+        f"continues from its own last frame{rest}. These are the first episodes of the split, not "
+        "selected."
     )
     films = [Figure(film, "video/mp4", caption=caption) for caption, film in gallery.videos]
     stills = [

@@ -271,6 +271,7 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     if own == "memory" and "none" not in margins:
         of_pewm = "stage1" in metrics["protocol"]["config"]["train"]
         lines.append(NONE_HOW if of_pewm else NONE_LACKING)
+    lines += [text] if (text := metrics["protocol"].get("geometry")) else []
     lines += [format_lpips(metrics), format_fvd(metrics)]
     lines += [format_coverage(metrics["coverage"])] if metrics["coverage"] else []
     lines += [format_drift(metrics["long"]["drift"][own]), *format_map_growth(metrics)]

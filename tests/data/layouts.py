@@ -177,7 +177,10 @@ def dequantize(codes, low=0.01, high=10.0, shift=3.5):
 
 
 def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None):
-    """All episodes in one file of rows and one video per camera, as LeRobot writes small sets."""
+    """All episodes in one file of rows and one video per camera, as LeRobot writes small sets.
+
+    ``actions`` (episodes, T, A) replace the two numbers episode and frame.
+    """
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -186,7 +189,9 @@ def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None):
     video = {"video.fps": float(fps), "video.codec": "h264", "video.pix_fmt": "yuv420p"}
     features = {
         camera: {"dtype": "video", "shape": [height, width, 3], "info": video},
-        "action": {"dtype": "float32", "shape": [2], "names": ["left", "right"]},
+        "action": {"dtype": "float32", "shape": [2], "names": ["left", "right"]}
+        if actions is None
+        else {"dtype": "float32", "shape": [len(actions[0][0])], "names": None},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
     }
     if depth:
@@ -201,6 +206,8 @@ def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None):
         for k in range(len(walk.pose)):
             row = {"episode_index": e, "frame_index": k, "index": start + k, "task_index": 0}
             row |= {"timestamp": k / fps, "action": [float(e), float(k)]}
+            if actions is not None:
+                row["action"] = [float(x) for x in actions[e][k]]
             if pose:
                 row["observation.camera_pose"] = walk.pose[k].tolist()
                 row["observation.intrinsics"] = walk.focal.tolist()
