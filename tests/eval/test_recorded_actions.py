@@ -118,8 +118,8 @@ def test_a_report_follows_the_recorded_actions(run, config, tmp_path):
     assert "Steering is not measured" in said
     assert compare.compare(tmp_path / "one", tmp_path / "one", out=tmp_path / "both").is_file()
     reported = results["model"]["all"]["psnr"]["mean"]
-    assert mean_psnr(run, config, 1) == pytest.approx(reported, abs=1e-2)
-    assert abs(mean_psnr(run, config, -1) - reported) > 0.1
+    assert mean_psnr(run, config, 1) == pytest.approx(reported, abs=2e-3)
+    assert abs(mean_psnr(run, config, -1) - reported) > 5e-3
 
 
 @pytest.mark.slow
