@@ -95,7 +95,9 @@ def make_gallery(config: Config, episodes: Sequence[Episode], long: LongRollouts
             "rollouts shown above it is the one with the most pixels seen before."
         ),
         moving=_moving(rollout),
-        masks=grid([rows[0], ("seen before", masked)], names),
+        masks=grid([rows[0], ("seen before", masked)], names)
+        if has_geometry(episodes[rollout.choice.episode])
+        else None,
         masks_note=MASKS_NOTE,
         above=_above(config, long, best, rollout)
         if "first_points" in long.kept.get("memory", {})

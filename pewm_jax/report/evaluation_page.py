@@ -86,7 +86,8 @@ class Gallery:
         strip: frames of one rollout in rows: ground truth, with its map, empty map, reprojected;
             for a model without a memory one row instead of two.
         moving: all frames of that rollout side by side, a GIF.
-        masks: the same ground-truth frames with never-seen pixels greyed out.
+        masks: the same ground-truth frames with never-seen pixels greyed out; None if the data have
+            no depth or poses.
         above: the map from above, before and after that rollout; None without a memory.
         rows: for each rollout shown, the frames of ``truth`` and of each method at the steps of
             ``strip``, side by side in one image and at full size.
@@ -96,7 +97,7 @@ class Gallery:
     strip: np.ndarray
     strip_note: str
     moving: bytes
-    masks: np.ndarray
+    masks: np.ndarray | None
     masks_note: str
     above: np.ndarray | None
     above_note: str
@@ -145,9 +146,11 @@ def _rollouts(gallery: Gallery) -> Section:
     )
     films = [Figure(film, "video/mp4", caption=caption) for caption, film in gallery.videos]
     stills = [
-        Figure(png(gallery.strip), alt="truth, imagined, reprojected", caption=gallery.strip_note),
-        Figure(png(gallery.masks), alt="seen before", caption=gallery.masks_note),
+        Figure(png(gallery.strip), alt="truth, imagined, reprojected", caption=gallery.strip_note)
     ]
+    if gallery.masks is not None:
+        masks = png(gallery.masks)
+        stills.append(Figure(masks, alt="seen before", caption=gallery.masks_note))
     return Section("Long rollouts, side by side", [Text(text), *films, *stills])
 
 
