@@ -80,6 +80,8 @@ class Launch(Join):
     inference: bool = False
     """Of a plan with `--compiler target`: compile what a trained model runs, on one device and with
     weights in bfloat16, instead of the training."""
+    quantize: str = ""
+    """Of a plan with `--inference`: `int8` or `fp8` keeps the weights of the denoiser in 8 bits."""
     json: str = ""
     """Of a plan: also write the numbers of every stage to this file."""
     compiled: str = "auto"
@@ -107,6 +109,10 @@ class Launch(Join):
         require(
             not (self.fit and self.inference),
             "--fit searches settings of training and --inference plans none: give one of them.",
+        )
+        require(
+            not self.quantize or self.inference,
+            f"--quantize {self.quantize} is for inference: add --inference --compiler target.",
         )
         require(self.tries >= 1, f"--tries is {self.tries}: use at least 1.")
         require(self.devices >= 1, f"--devices is {self.devices}: use at least 1.")

@@ -152,10 +152,17 @@ def quantize(kernel: Any, precision: Precision, *, stacked: bool) -> Quantized:
     each value, or 2⁻¹⁰/448 of the largest for values near zero.
 
     Args:
-        kernel: the weight; not a scalar or a vector.
+        kernel: the weight, not a scalar or a vector; or its shape, for that of the result.
         precision: the format.
         stacked: whether the first axis is the layer, each of which has scales of its own.
     """
+    if isinstance(kernel, jax.ShapeDtypeStruct):  # a plan has no values
+        kept = [n if k < stacked else 1 for k, n in enumerate(kernel.shape[:-1])]
+        return Quantized(
+            jax.ShapeDtypeStruct(kernel.shape, DTYPES[precision]),
+            jax.ShapeDtypeStruct((*kept, kernel.shape[-1]), np.float32),
+            jnp.dtype(kernel.dtype).name,
+        )
     array = np.asarray(kernel)
     wide = array.astype(np.float32)
     axes = tuple(range(int(stacked), wide.ndim - 1))

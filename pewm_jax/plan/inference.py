@@ -22,6 +22,7 @@ from pewm_jax.data import abstract
 from pewm_jax.nn import target
 from pewm_jax.train import flops
 from pewm_jax.train.flops import Work
+from pewm_jax.worlds import quantized
 
 START, CLIP, UPDATE, MANY = "start", "clip", "update", "imagine_many"
 """The programs: a world from the frames of ``data.context``; one clip, remembered; real frames, as
@@ -66,18 +67,19 @@ def names(config: Config) -> tuple[str, ...]:
     return (START, *clips, *update, MANY)
 
 
-def title(config: Config, name: str) -> str:
+def title(config: Config, name: str, quantize: str = "") -> str:
     """Return the description of a program."""
     kind, _, steps = name.partition("-")
     count, drawn = config.model.clip.frames - 1, f", {config.model.sample_steps} sampling steps"
     clip = f"a clip of {count} actions"
     sampled = drawn if config.model.sample_steps else ""
-    return {
+    found = {
         START: f"start from {config.data.context} frames",
         CLIP: f"{clip}, {steps} sampling steps" if steps else clip,
         UPDATE: f"update of the memory by {count} frames",
         MANY: f"imagine_many: {CANDIDATES} candidates of {count} actions{sampled}",
     }[kind]
+    return f"{found}, weights in {quantize}" if quantize else found
 
 
 def _can_sample(world: World, steps: int) -> bool:
@@ -87,13 +89,13 @@ def _can_sample(world: World, steps: int) -> bool:
         return False
 
 
-def program(config: Config, name: str) -> Program:
-    """Return the program of a name from ``names``."""
+def program(config: Config, name: str, quantize: str = "") -> Program:
+    """Return the program of a name from ``names``; ``quantize`` is as for ``pewm_jax.load``."""
     kind, _, steps = name.partition("-")
     world = worlds.require_world(config.model, "a plan of inference")
     if kind == CLIP and steps:
         world = world.with_sample_steps(int(steps))
-    params = abstract_weights(world)
+    params = quantized.quantize(world, abstract_weights(world), quantize)
     observed = _frames(config, config.data.context)
     if kind == START:
         return Program(functools.partial(worlds.start, world), (params, observed))

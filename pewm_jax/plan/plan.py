@@ -108,7 +108,7 @@ def show(
     if on_target:
         topology.require_compiler(chip)
     if launch.inference:
-        found = _plan_inference(config, chip, log)
+        found = _plan_inference(config, chip, launch.quantize, log)
     else:
         found = _plan_training(config, chip, launch, log)
     plans: list[StagePlan | StageReport] = []
@@ -140,13 +140,13 @@ def _plan_training(config: Config, chip: Chip, launch: Launch, log: Any) -> Iter
 
 
 def _plan_inference(
-    config: Config, chip: Chip, log: Any
+    config: Config, chip: Chip, quantize: str, log: Any
 ) -> Iterator[tuple[StageReport, Iterator[str]]]:
     """Yield what a chip's compiler says about each program of inference, and its lines."""
     for name in inference.names(config):
-        title = inference.title(config, name)
+        title = inference.title(config, name, quantize)
         log(f"{title}: compiling it for one {chip.name} …")
-        report = target_compiler.compile_inference(config, name, chip)
+        report = target_compiler.compile_inference(config, name, chip, quantize)
         yield report, report_lines(report, title)
 
 

@@ -128,16 +128,18 @@ def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> Stage
     return _ask(config, chip, stage, devices, "stage")
 
 
-def compile_inference(config: Config, program: str, chip: Chip) -> StageReport:
-    """Compile a program of ``inference.NAMES`` for one device in a process of its own.
+def compile_inference(config: Config, program: str, chip: Chip, quantize: str = "") -> StageReport:
+    """Compile a program of ``inference.names`` for one device in a process of its own.
 
     Raises:
         UserError: as for ``compile_stage``.
     """
-    return _ask(config, chip, program, 1, "inference")
+    return _ask(config, chip, program, 1, "inference", quantize)
 
 
-def _ask(config: Config, chip: Chip, name: str, devices: int, kind: str) -> StageReport:
+def _ask(
+    config: Config, chip: Chip, name: str, devices: int, kind: str, quantize: str = ""
+) -> StageReport:
     """Start the process that compiles, and return its report."""
     topology.require_compiler(chip)
     request = {
@@ -147,6 +149,7 @@ def _ask(config: Config, chip: Chip, name: str, devices: int, kind: str) -> Stag
         "name": name,
         "chip": chip.name,
         "devices": devices,
+        "quantize": quantize,
         "parent": os.getpid(),
     }
     with tempfile.TemporaryDirectory(prefix="pewm-plan-") as folder:
@@ -198,8 +201,11 @@ def main(asked: str, answered: str) -> None:
             _load(name, file)
         config = serialize.from_dict(Config, request["config"])
         chip = chips.named(request["chip"])
-        made = _inference if request["kind"] == "inference" else _stage
-        answer = dataclasses.asdict(made(config, request["name"], chip, request["devices"]))
+        if request["kind"] == "inference":
+            report = _inference(config, request["name"], chip, request["quantize"])
+        else:
+            report = _stage(config, request["name"], chip, request["devices"])
+        answer = dataclasses.asdict(report)
     except UserError as error:
         answer = {"error": str(error)}
     Path(answered).write_text(json.dumps(answer))
@@ -255,20 +261,20 @@ def _stage(config: Config, name: str, chip: Chip, count: int) -> StageReport:
     return _compiled(report, lowered, config, chip)
 
 
-def _inference(config: Config, name: str, chip: Chip, count: int) -> StageReport:
+def _inference(config: Config, name: str, chip: Chip, quantize: str) -> StageReport:
     """Trace and compile a program of inference, in the process for it."""
     from pewm_jax.plan import inference, measure  # noqa: PLC0415
     from pewm_jax.train import flops  # noqa: PLC0415
 
-    program = inference.program(config, name)
+    program = inference.program(config, name, quantize)
     began = time.monotonic()
-    traced = inference.trace(program, topology.devices(chip, count)[0])
+    traced = inference.trace(program, topology.devices(chip, 1)[0])
     lowered = traced.lower()
     trace_s = time.monotonic() - began
     report = StageReport(
         name=name,
         chip=chip.name,
-        devices=count,
+        devices=1,
         mesh=measure.MeshSizes().sizes,
         compiler=topology.compiler(chip),
         argument_bytes=program.argument_bytes,

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets, worlds
-from pewm_jax.config import Launch, UserError
+from pewm_jax.config import ConfigError, Launch, UserError
 from pewm_jax.plan import inference, plan, target_compiler, topology
 from pewm_jax.plan.target_compiler import StageReport
 from pewm_jax.train import chips
+from pewm_jax.worlds import quantized
 from tests.plan.test_target_compiler import report
 
 TINY = presets.load("tiny")
@@ -66,6 +67,20 @@ def test_every_program_can_be_traced_and_its_work_counted(name):
     assert main.count("%arg") == len(jax.tree.leaves(program.arguments)), "no weight is dropped"
 
 
+def test_weights_in_8_bits_take_half_and_compute_as_much():
+    whole, eight = (inference.program(TINY, "clip-4", precision) for precision in ("", "int8"))
+    assert eight.argument_bytes < whole.argument_bytes
+    assert inference.needed(eight).total == inference.needed(whole).total
+    real = worlds.init(TINY.model, jax.random.key(0))
+    real = jax.tree.map(lambda x: x.astype(jnp.bfloat16), real)
+    real = jax.tree.leaves(quantized.quantize(TINY.model, real, "int8"))
+    shapes = jax.tree.leaves(eight.arguments[0])
+    assert [(x.shape, x.dtype) for x in shapes] == [(x.shape, x.dtype) for x in real]
+    assert inference.title(TINY, "start", "int8").endswith("weights in int8")
+    with pytest.raises(ConfigError, match="--quantize int8 is for inference: add --inference"):
+        Launch(quantize="int8")
+
+
 def test_cards_are_compared_in_gigabytes():
     assert inference.fits_gb(16e9) == {"16": True, "24": True, "80": True}
     assert inference.fits_gb(16e9 + 1) == {"16": False, "24": True, "80": True}
@@ -75,7 +90,7 @@ def test_cards_are_compared_in_gigabytes():
 def test_the_command_prints_and_writes_every_program(monkeypatch, tmp_path):
     asked = []
 
-    def compiled(config, name, chip):
+    def compiled(config, name, chip, quantize):
         asked.append((name, chip.name))
         return report(name=name, devices=1, fits_gb=inference.fits_gb(20e9))
 
