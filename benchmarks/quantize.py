@@ -88,7 +88,7 @@ def main() -> None:
     text = table(heads, rows)
     print(text)
     if given.record:
-        about = f"{given.model}, clips of {len(WALK)} frames in held-out houses. {machine()}"
+        about = f"{given.model}, clips of {len(WALK)} frames in held-out houses. {machine('jax')}"
         record("quantize", f"{about}\n\n{text}")
 
 
