@@ -15,7 +15,7 @@ from pewm_jax.errors import UserError, require
 from pewm_jax.planning.observations import gymnasium
 
 try:
-    from stable_baselines3.common.vec_env import VecEnv
+    from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 except ImportError:
     raise UserError(
         "this needs Stable-Baselines3, which is not installed: pip install 'pewm-jax[rl]'."
