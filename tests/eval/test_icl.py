@@ -30,6 +30,7 @@ def data(tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_its_cameras_steer_the_world_model(data, tmp_path):
     config = tiny(tmp_path)
     params = worlds.init(config.model, jax.random.key(0))
@@ -46,6 +47,7 @@ def test_its_cameras_steer_the_world_model(data, tmp_path):
     assert int(real.map.occupied) >= int(state.map.occupied)
 
 
+@pytest.mark.slow
 def test_it_is_scored_along_its_own_cameras(data, tmp_path):
     config = tiny(tmp_path, clips=2, seeds=(0,), videos=1, video_clips=1)
     config = dataclasses.replace(config, data=dataclasses.replace(config.data, path=str(data)))

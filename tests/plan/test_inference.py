@@ -67,6 +67,7 @@ def test_every_program_can_be_traced_and_its_work_counted(name):
     assert main.count("%arg") == len(jax.tree.leaves(program.arguments)), "no weight is dropped"
 
 
+@pytest.mark.slow
 def test_weights_in_8_bits_take_half_and_compute_as_much():
     whole, eight = (inference.program(TINY, "clip-4", precision) for precision in ("", "int8"))
     assert eight.argument_bytes < whole.argument_bytes

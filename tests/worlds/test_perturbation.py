@@ -45,6 +45,7 @@ def differs(a, b):
     return np.any([np.any(np.asarray(x) != y, tuple(range(1, x.ndim))) for x, y in leaves], 0)
 
 
+@pytest.mark.slow
 def test_the_share_of_clips_that_get_errors():
     readout, camera = shown()
     assert not differs(plant(MODEL, 0.0, readout, camera, KEY), readout).any()
