@@ -12,6 +12,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
 
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.config.launch import is_address
@@ -33,6 +35,16 @@ HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
 UNRECORDED = VoxelsConfig()
+HANDHELD = 3
+"""Number that is folded into the seed of hand-held cameras."""
+HANDHELD_HFOV = 55.0, 100.0
+"""Smallest and largest horizontal field of view of a hand-held camera, degrees."""
+HANDHELD_LOWER_M = 0.4
+"""How far, at most, a hand-held camera is below ``camera_height``, metres."""
+HANDHELD_PITCH_DEG, HANDHELD_ROLL_DEG = 12.0, 4.0
+"""Deviations of its pitch and roll, degrees."""
+HANDHELD_FRAMES = 8
+"""Frames over which its pitch and roll are correlated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +75,9 @@ class CollectConfig:
     """Length of a forward step, metres (continuous actions: the largest)."""
     turn_deg: float = 30.0
     """Angle of a turn, degrees (continuous actions: the largest)."""
+    handheld: float = 0.0
+    """Share of the episodes of train/ that are filmed as by hand: each has its own field of view
+    (55 to 100 degrees) and height (up to 0.4 m lower), and pitch and roll that change slowly."""
     turn_around: float = 0.5
     """Probability of a full turn at the start of an episode; revisit episodes always have it."""
     policy: Literal["follow", "walk"] = "follow"
@@ -114,6 +129,8 @@ class CollectConfig:
             raise ConfigError("--train, --validation and --test are all 0: nothing to collect.")
         if not 0 <= self.turn_around <= 1:
             raise ConfigError(f"--turn-around is {self.turn_around}: use a probability, 0 to 1.")
+        if not 0 <= self.handheld <= 1:
+            raise ConfigError(f"--handheld is {self.handheld}: use a share of episodes, 0 to 1.")
         if not 1 <= self.hfov < 180:
             raise ConfigError(f"--hfov is {self.hfov}: use 1 up to below 180 degrees.")
         if self.frames < 2:
@@ -165,6 +182,8 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
     # Defaults of newer settings are left out, so that older datasets compare as equal.
     if split != "revisit" or config.test_policy == "revisit":
         del settings["test_policy"]
+    if split != "train" or not config.handheld:
+        del settings["handheld"]
     if not config.moving:
         del settings["moving"]
     if settings["voxels"]["pictures"] == UNRECORDED.pictures:
@@ -215,9 +234,19 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         turn_around=config.turn_around,
         continuous=config.continuous,
     )
-    pose = walk.world_from_camera(grid.floor_z + config.camera_height)
     size = config.size, config.size
-    camera = Camera(intrinsics_from_fov(*size, config.hfov), pose)
+    hfov, height = config.hfov, config.camera_height
+    tilt_T33 = None
+    if split == "train" and config.handheld:
+        rng = np.random.default_rng([config.seed, SPLITS.index(split), index, HANDHELD])
+        if rng.random() < config.handheld:
+            hfov = rng.uniform(*HANDHELD_HFOV)
+            height -= rng.uniform(0, min(HANDHELD_LOWER_M, height / 2))
+            tilt_T33 = _tilts(rng, config.frames)
+    pose = walk.world_from_camera(grid.floor_z + height)
+    if tilt_T33 is not None:
+        pose[:, :3, :3] = pose[:, :3, :3] @ tilt_T33
+    camera = Camera(intrinsics_from_fov(*size, hfov), pose)
     parts = None if moving is None else moving.poses(walk.planar_T3[:, :2])
     voxels = None
     if config.voxels.record:
@@ -241,7 +270,7 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     )
     info: dict[str, Any] = {
         "policy": policy,
-        "camera_height_m": config.camera_height,
+        "camera_height_m": round(height, 6),
         "floor_z_m": round(float(grid.floor_z), 6),
         "step_m": config.step_m,
         "turn_deg": config.turn_deg,
@@ -255,6 +284,16 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     if walk.return_frame is not None:
         info["return_frame"] = walk.return_frame
     return write_episode(arrays, f"{split}-{index:06d}", scene.name, info)
+
+
+def _tilts(rng: np.random.Generator, frames: int) -> np.ndarray:
+    """Return rotations (T, 3, 3) of a camera about its own x axis (pitch) and z axis (roll)."""
+    noise = rng.normal(size=(frames + 4 * HANDHELD_FRAMES, 2))
+    smooth = gaussian_filter1d(noise, HANDHELD_FRAMES, axis=0)[2 * HANDHELD_FRAMES :][:frames]
+    unit = smooth * np.sqrt(2 * HANDHELD_FRAMES * np.sqrt(np.pi))  # deviation 1
+    angles_T2 = unit * (HANDHELD_PITCH_DEG, HANDHELD_ROLL_DEG)
+    turns = Rotation.from_euler("xz", angles_T2, degrees=True)
+    return turns.as_matrix().astype(np.float32)
 
 
 _house = functools.lru_cache(maxsize=1)(open_house)
