@@ -79,6 +79,9 @@ class DataConfig:
     prepared_path: str = ""
     """Folder that keeps prepared clips on disk (about 1 MB each at 64 × 64), for resuming this run
     and for other runs with the same clips; empty: only in main memory."""
+    refresh: int = 0
+    """Steps after which the oldest batch of prepared clips is replaced by a new one; 0 keeps them.
+    New ones are prepared while training goes on, and old ones are deleted from `prepared_path`."""
     workers: int = 0
     """Threads that read and decode data ahead of training; 0 means one."""
     bad_records: int = 0
@@ -93,8 +96,13 @@ class DataConfig:
             "1 ≤ min ≤ max.",
         )
         require_positive(self, "data", "context")
-        counts = ("prepared", "workers", "bad_records")
+        counts = ("prepared", "refresh", "workers", "bad_records")
         require_fields(self, "data", lambda value: value >= 0, "0 or more", *counts)
+        require(
+            self.prepared > 0 or not self.refresh,
+            f"data.refresh is {self.refresh}, and no clips are prepared: set data.prepared, or use "
+            "data.refresh 0.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Sharding
 
@@ -144,55 +145,111 @@ def uses_prepared(config: Config, stage: Stage) -> bool:
     return True
 
 
-def prepare_clips(
-    config: Config,
-    stage: Stage,
-    params: Params,
-    read: Callable[[int], Iterator[Clip]],
-    unless_stopped: Callable[[Callable[[], Any]], Any],
-    digest: str = "",
-) -> list[Clip] | None:
-    """Prepare ``data.prepared`` clips (rounded up to batches, at most those drawn) or reuse them.
+class Prepared:
+    """Clips that are prepared once and drawn repeatedly, all of them or the newest.
+
+    With ``data.refresh`` R, the clips of step n are the loader's batches from n div R on: after
+    every R steps the oldest batch gives way to a new one. So the clips of a step do not depend on
+    interruptions.
 
     Args:
         config: the experiment.
         stage: defines the preparation (``Stage.prepare``).
-        params: the weights.
+        params: the weights; those that prepare clips are copied.
         read: returns an iterator over the batches to prepare, starting at a batch number.
-        unless_stopped: calls its argument; returns None if training must stop.
+        done: steps that are done.
         digest: from ``start_digest``; if empty, the digest of ``params`` is used.
-
-    Returns:
-        Batches of NumPy arrays, in memory or memory-mapped; None if training must stop.
     """
-    assert stage.prepare is not None
-    make = jax.jit(functools.partial(stage.prepare, config.model))
-    count = _batches(config, stage)
-    folder = None
-    if config.data.prepared_path:
-        folder = _folder(config, stage, digest or _digest(stage, params))
-    kept: list[Clip] = []
-    if folder is not None:
-        like = jax.eval_shape(make, params, next(read(0)))
-        while len(kept) < count and (file := _file(folder, len(kept))).is_file():
-            kept.append(_map_file(file, like))
-    if len(kept) == count:
-        return kept
-    batches = read(len(kept))
-    with Meter(f"preparing {stage.title}'s clips", count - len(kept), "batches") as meter:
-        for number in range(len(kept), count):
-            batch = unless_stopped(lambda: next(batches))
-            if batch is None:
-                return None
-            clip = jax.device_get(make(params, batch))
-            if folder is not None:
-                leaves = _clip_arrays(clip)
-                file = _file(folder, number)
-                tensor_files.write(file, leaves, leaves.items(), tensor_files.header({}))
-                clip = _map_file(file, like)
-            kept.append(clip)
-            meter.advance(1)
-    return kept
+
+    def __init__(
+        self,
+        config: Config,
+        stage: Stage,
+        params: Params,
+        read: Callable[[int], Iterator[Clip]],
+        done: int = 0,
+        digest: str = "",
+    ):
+        assert stage.prepare is not None
+        self._config, self._stage, self._read = config, stage, read
+        weights = {name: params[name] for name in stage.prepares_by if name in params}
+        # A training step may reuse the memory of its arguments.
+        self._weights = jax.tree.map(jnp.copy, weights) if config.data.refresh else weights
+        self._make = jax.jit(functools.partial(stage.prepare, config.model))
+        self._folder: Path | None = None
+        if config.data.prepared_path:
+            self._folder = _folder(config, stage, digest or _digest(stage, params))
+        self._done = done
+        self.batches: list[Clip] = []
+        self._source: Iterator[Clip] | None = None
+
+    @functools.cached_property
+    def _like(self) -> Clip:
+        return jax.eval_shape(self._make, self._weights, next(self._read(0)))
+
+    def _next(self) -> int:
+        """Return the loader's number of the batch that is prepared next."""
+        return _oldest(self._config, self._done) + len(self.batches)
+
+    def fill(self, unless_stopped: Callable[[Callable[[], Any]], Any]) -> bool:
+        """Prepare ``data.prepared`` clips, rounded up to batches, at most those drawn; or read them.
+
+        ``unless_stopped`` calls its argument, and returns None if training must stop. Returns
+        whether all are there.
+        """
+        count = _batches(self._config, self._stage)
+        while len(self.batches) < count and (clip := self._kept()) is not None:
+            self.batches.append(clip)
+        if len(self.batches) == count:
+            return True
+        missing = count - len(self.batches)
+        with Meter(f"preparing {self._stage.title}'s clips", missing, "batches") as meter:
+            for _ in range(missing):
+                clip = unless_stopped(self._prepare)
+                if clip is None:
+                    return False
+                self.batches.append(clip)
+                meter.advance(1)
+        return True
+
+    def draw(self, batch: int, seed: int) -> Iterator[Clip]:
+        """Yield the batches of the steps that are left, endlessly."""
+        refresh = self._config.data.refresh
+        if not refresh:
+            yield from draw_prepared(self.batches, batch, seed, self._done)
+        for number in itertools.count(self._done):
+            if number > self._done and number % refresh == 0:
+                clip = self._kept()
+                self.batches.append(self._prepare() if clip is None else clip)
+                self.batches.pop(0)
+                self._done = number
+                if self._folder is not None:
+                    _file(self._folder, _oldest(self._config, number) - 1).unlink(missing_ok=True)
+            yield _stacked(self.batches, _rows_of_window(len(self.batches), batch, seed, number))
+
+    def _kept(self) -> Clip | None:
+        """Return the next batch from disk; None if it is not there."""
+        if self._folder is None or not (file := _file(self._folder, self._next())).is_file():
+            return None
+        self._source = None  # it would yield the batch that is read here
+        return _map_file(file, self._like)
+
+    def _prepare(self) -> Clip:
+        """Prepare the next batch, and keep it on disk if asked for."""
+        if self._source is None:
+            self._source = self._read(self._next())
+        clip = jax.device_get(self._make(self._weights, next(self._source)))
+        if self._folder is None:
+            return clip
+        leaves = _clip_arrays(clip)
+        file = _file(self._folder, self._next())
+        tensor_files.write(file, leaves, leaves.items(), tensor_files.header({}))
+        return _map_file(file, self._like)
+
+
+def _oldest(config: Config, done: int) -> int:
+    """Return the loader's number of the oldest prepared batch after a number of steps."""
+    return done // config.data.refresh if config.data.refresh else 0
 
 
 def start_digest(run: Path, stage: Stage, params: Params, done: int) -> str:
@@ -236,8 +293,9 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
             del section[setting]
     data = configuration.to_dict(config.data)
     split = read_manifest(Path(config.data.path) / "train")
-    for setting in ("path", "features", "prepared", "prepared_path", "workers", "bad_records"):
+    for setting in ("path", "features", "prepared", "prepared_path", "refresh", "workers"):
         data.pop(setting)
+    data.pop("bad_records")
     facts = {
         "version": PREPARED_VERSION,
         "model": model,
@@ -288,22 +346,37 @@ def draw_prepared(
 
     Each epoch contains every clip once, in a new order. ``start`` is the number of the first batch.
     """
+    count = sum(len(jax.tree.leaves(part)[0]) for part in prepared)
+    for number in itertools.count(start):
+        yield _stacked(prepared, _rows(count, batch, seed, number))
+
+
+def _stacked(prepared: Sequence[Clip], rows: Sequence[int]) -> Clip:
+    """Return the batch of these rows of all prepared batches."""
     sizes = [len(jax.tree.leaves(part)[0]) for part in prepared]
     places = [(part, row) for part, size in enumerate(sizes) for row in range(size)]
-    for number in itertools.count(start):
-        chosen = [places[row] for row in _rows(len(places), batch, seed, number)]
-        clips = (jax.tree.map(lambda x, r=row: x[r], prepared[part]) for part, row in chosen)
-        yield jax.tree.map(lambda *rows: np.stack(rows), *clips)
+    chosen = [places[row] for row in rows]
+    clips = (jax.tree.map(lambda x, r=row: x[r], prepared[part]) for part, row in chosen)
+    return jax.tree.map(lambda *rows: np.stack(rows), *clips)
 
 
 def prepared_rows(config: Config, stage: Stage, number: int) -> list[int]:
-    """Return the indices of the prepared clips in batch ``number``; see ``draw_prepared``.
+    """Return the indices of the prepared clips in batch ``number``; see ``Prepared``.
 
     With loader batches of size B, clip r is row r mod B of loader batch r div B.
     """
-    batch = stage.settings(config).batch
-    count = _batches(config, stage) * batch
-    return _rows(count, batch, stage.data_seed(config), number)
+    batch, seed = stage.settings(config).batch, stage.data_seed(config)
+    count = _batches(config, stage)
+    if not config.data.refresh:
+        return _rows(count * batch, batch, seed, number)
+    first = _oldest(config, number) * batch
+    return [first + row for row in _rows_of_window(count, batch, seed, number)]
+
+
+def _rows_of_window(count: int, batch: int, seed: int, number: int) -> list[int]:
+    """Draw the rows of one batch from ``count`` batches, which change with time."""
+    drawn = np.random.default_rng((seed, number)).choice(count * batch, batch, replace=False)
+    return [int(row) for row in drawn]
 
 
 def _batches(config: Config, stage: Stage) -> int:

@@ -27,8 +27,7 @@ from pewm_jax.train import flops, loading, processes, runs, sharding, sinks
 from pewm_jax.train.checkpoint import Checkpoints
 from pewm_jax.train.feed import (
     Feed,
-    draw_prepared,
-    prepare_clips,
+    Prepared,
     prepared_seed,
     rows_of,
     start_digest,
@@ -257,12 +256,10 @@ class _Worker:
         digest = ""
         if self.config.data.prepared_path:
             digest = start_digest(self.path, self.stage, state.params, done)
-        clips = prepare_clips(
-            self.config, self.stage, state.params, read, self.stop.unless_requested, digest
-        )
-        if clips is None:
+        clips = Prepared(self.config, self.stage, state.params, read, done, digest)
+        if not clips.fill(self.stop.unless_requested):
             raise self.stop.interrupted(self.stage.title, done)
-        return draw_prepared(clips, batch, seed, done)
+        return clips.draw(batch, seed)
 
     def _compile(self, done: int, clip: Clip, state: TrainState | None):
         """Make the state (its initialization is compiled, too) and compile the step."""

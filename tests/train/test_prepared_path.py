@@ -73,7 +73,8 @@ def gather(config, params=PARAMS, most=None, stage=STAGE):
     def unless_stopped(call):
         return None if most is not None and next(done) > most else call()
 
-    return feed.prepare_clips(config, stage, params, reader, unless_stopped), reader.taken
+    clips = feed.Prepared(config, stage, params, reader)
+    return clips.batches if clips.fill(unless_stopped) else None, reader.taken
 
 
 def same(one, two):
@@ -114,6 +115,31 @@ def test_a_folder_half_made_is_continued(tmp_path):
     same(clips, gather(experiment(""))[0])
     more = experiment(tmp_path, prepared=4 * 8)  # other runs may want more of the same
     assert gather(more)[1] == [0, 3]
+
+
+def test_old_clips_give_way_to_new_ones_also_after_an_interruption(tmp_path):
+    def draw(config, done, count):
+        clips = feed.Prepared(config, STAGE, PARAMS, Reader(config), done)
+        assert clips.fill(lambda call: call())
+        return list(itertools.islice(clips.draw(8, STAGE.data_seed(config)), count))
+
+    kept = experiment(tmp_path)
+    for folder in ("", tmp_path):
+        config = experiment(folder)
+        data = dataclasses.replace(config.data, refresh=2)
+        config = dataclasses.replace(config, data=data)
+        whole = draw(config, 0, 7)
+        same(draw(config, 3, 4), whole[3:])
+    names = [file.stem for file in files(tmp_path)]
+    assert names == ["00003", "00004", "00005"]  # steps 6 and 7 of three batches each
+    source = fakes.clips(kept, seed=feed.prepared_seed(kept, STAGE), batch=8)
+    loaded = list(itertools.islice(source, 6))
+    for step, drawn in enumerate(whole):
+        rows = feed.prepared_rows(config, STAGE, step)
+        assert min(rows) >= step // 2 * 8
+        assert max(rows) < (step // 2 + 3) * 8
+        depth = [loaded[row // 8].frames.depth_THW[row % 8] for row in rows]
+        np.testing.assert_array_equal(drawn.frames.depth_THW, np.stack(depth))
 
 
 def test_what_is_not_whole_or_not_ours_is_refused_with_its_name(tmp_path):
