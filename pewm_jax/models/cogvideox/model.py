@@ -63,7 +63,7 @@ class LayerNormZero(nn.Module):
         ``time_BE`` is (B, E); or (B, 1 + t, E): the text's, then one for each token in time.
         """
         width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
-        linear = nn.Dense(
+        linear = modules.Dense(
             6 * width,
             dtype=dtype,
             kernel_init=modules.zeros,
