@@ -132,7 +132,7 @@ def _loaded(
 def _rendered(config: Any, runner: ModelRunner, batch: Batch) -> np.ndarray:
     """Return (B, H, W, 3) the memory rendered for the last camera, grey where it shows nothing."""
     model = config.model
-    state = runner.begin(batch.context)
+    state: Any = runner.begin(batch.context)
     last: Camera = jax.tree.map(lambda x: jnp.asarray(x)[:, -1:], batch.targets.camera)
 
     def one(memory: Any, camera: Camera) -> Any:

@@ -239,8 +239,8 @@ def _check_actions(episode: Episode) -> Found:
     for frame in np.flatnonzero(~np.isfinite(actions).all(1))[:1]:
         yield int(frame), "contains NaN or infinity."
         return
-    if actions.shape[1] != PLANAR:  # for other kinds of control the motion is unknown
-        return
+    if actions.shape[1] != PLANAR or episode.info.get("handheld"):
+        return  # the motion of other controls is unknown; poses of hand-held cameras are measured
     metres, radians = action_errors(episode.world_from_camera, actions)
     for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:
         what = (

@@ -1,8 +1,8 @@
 """7-Scenes: ``seq-01/frame-000000.{color.png,depth.png,pose.txt}``, one file of each per frame.
-Copies with colours as JPEG (``color.jpg``) are read, too.
 
-Depth is in millimetres, 65535 is no measurement; poses are camera-to-world, of a world that begins
-at the first camera. The focal length is 585 pixels at 640 × 480, the centre that of the image.
+Copies with colours as JPEG (``color.jpg``) are read, too. Depth is in millimetres, 65535 is no
+measurement; poses are camera-to-world, of a world that begins at the first camera. The
+focal length is 585 pixels at 640 × 480, the centre that of the image.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class SevenScenes(FolderFormat):
     """The layout of 7-Scenes."""
 
     NAME: ClassVar[str] = "7scenes"
-    LAYOUT: ClassVar[str] = "frame-000000.color.png (or .jpg), .depth.png and .pose.txt, as in seq-01/"
+    LAYOUT: ClassVar[str] = "frame-000000.color.png or .jpg, .depth.png, .pose.txt, as in seq-01/"
     UP: ClassVar[str] = "-y"
     CENTRES: ClassVar[str] = "half"
 
