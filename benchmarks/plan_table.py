@@ -42,11 +42,11 @@ DEVICES = 8
 HEADS = {
     TRAINING: (
         *("model", "stage", "devices", "mesh", "memory of a device", "fits", "executed"),
-        *("attention", "step at best", "bound by", "MFU", "compiled in"),
+        *("attention", "step at best", "bound by", "MFU", "compiled in (CPU)"),
     ),
     INFERENCE: (
         *("model", "program", "chip", "memory", *(f"{gb} GB" for gb in inference.CARDS_GB)),
-        *("executed", "at best", "bound by", "compiled in"),
+        *("executed", "at best", "bound by", "compiled in (CPU)"),
     ),
 }
 
@@ -128,7 +128,7 @@ def row(piece: Piece, found: dict[str, Any]) -> list[str]:
     if piece.table == INFERENCE:
         cards = ["yes" if ok else "**no**" for ok in report.fits_gb.values()]
         executed = flop(report.flops_executed)
-        return [*head, piece.chip.name, peak, *cards, executed, *times, duration(report.compile_s)]
+        return [*head, piece.chip.name, peak, *cards, executed, *times, _seconds(report)]
     kernels = sorted(report.kernels.get("attention", {}))
     fits = "yes" if report.fits else "**no**"
     return [
@@ -141,8 +141,13 @@ def row(piece: Piece, found: dict[str, Any]) -> list[str]:
         _family(kernels),
         *times,
         "" if report.mfu is None else f"{report.mfu:.0%}",
-        duration(report.compile_s),
+        _seconds(report),
     ]
+
+
+def _seconds(report: StageReport) -> str:
+    """Return the time of compilation, and the processor's."""
+    return f"{duration(report.compile_s)} ({duration(report.compile_cpu_s)})"
 
 
 def _family(kernels: Sequence[str]) -> str:

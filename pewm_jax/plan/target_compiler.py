@@ -81,6 +81,7 @@ class StageReport:
         tries: what was compiled to find them; of ``--fit`` only.
         trace_s: seconds of tracing and lowering.
         compile_s: seconds of compilation.
+        compile_cpu_s: processor time of compilation, in seconds, over all threads.
         notes: what is uncertain about the numbers.
     """
 
@@ -111,6 +112,7 @@ class StageReport:
     tries: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     trace_s: float = 0.0
     compile_s: float = 0.0
+    compile_cpu_s: float = 0.0
     notes: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -295,7 +297,7 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
     from pewm_jax.plan import measure, program, suggest  # noqa: PLC0415
 
     sizes = measure.MeshSizes(**report.mesh)
-    began = time.monotonic()
+    began, cpu_began = time.monotonic(), time.process_time()
     with tempfile.TemporaryDirectory(prefix="pewm-hlo-") as folder:
         # A TPU's compiled program cannot always be printed; what its compiler writes can be read.
         written: dict[str, str | bool] = (
@@ -311,8 +313,9 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
                 options = NO_TRITON
                 compiled = lowered.compile(compiler_options={**written, **options})
         except jax.errors.JaxRuntimeError as error:
-            return _refused(report, str(error), time.monotonic() - began, options)
-        compile_s = time.monotonic() - began
+            seconds = time.monotonic() - began, time.process_time() - cpu_began
+            return _refused(report, str(error), seconds, options)
+        seconds = time.monotonic() - began, time.process_time() - cpu_began
         text = _text(compiled, Path(folder))
     memory: Any = compiled.memory_analysis()
     arguments, temporary = measure.device_memory(compiled)
@@ -325,7 +328,8 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
         alias_bytes=float(memory.alias_size_in_bytes),
         peak_bytes=arguments + temporary,
         fits=arguments + temporary <= report.capacity_bytes,
-        compile_s=compile_s,
+        compile_s=seconds[0],
+        compile_cpu_s=seconds[1],
     )
     if not text:
         report.notes.append("The compiler does not print this program: its kernels are unknown.")
@@ -364,9 +368,11 @@ def _text(compiled: Any, folder: Path) -> str:
 
 
 def _refused(
-    report: StageReport, message: str, seconds: float, options: dict[str, Any]
+    report: StageReport, message: str, seconds: tuple[float, float], options: dict[str, Any]
 ) -> StageReport:
     """Return the report of a program that the compiler refuses for its memory.
+
+    ``seconds`` are those of compilation and of the processor.
 
     Raises:
         UserError: it refuses for another reason.
@@ -386,7 +392,8 @@ def _refused(
         peak_bytes=peak,
         capacity_bytes=available or report.capacity_bytes,
         refusal=sentence[:400],
-        compile_s=seconds,
+        compile_s=seconds[0],
+        compile_cpu_s=seconds[1],
     )
 
 
