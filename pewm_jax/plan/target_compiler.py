@@ -121,13 +121,17 @@ def sent_by_axes(sent: Mapping[tuple[str, str], float]) -> list[dict[str, Any]]:
     return [{"kind": kind, "axis": axes, "bytes": size} for (kind, axes), size in sent.items()]
 
 
-def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> StageReport:
+def compile_stage(
+    config: Config, stage: str, chip: Chip, devices: int, slices: int = 1
+) -> StageReport:
     """Compile the training step of the stage of this name in a process of its own.
+
+    ``slices`` is the number of slices of TPUs that ``devices`` are.
 
     Raises:
         UserError: the compiler is not installed, or it fails for another reason than memory.
     """
-    return _ask(config, chip, stage, devices, "stage")
+    return _ask(config, chip, stage, devices, "stage", slices=slices)
 
 
 def compile_inference(config: Config, program: str, chip: Chip, quantize: str = "") -> StageReport:
@@ -136,11 +140,11 @@ def compile_inference(config: Config, program: str, chip: Chip, quantize: str = 
     Raises:
         UserError: as for ``compile_stage``.
     """
-    return _ask(config, chip, program, 1, "inference", quantize)
+    return _ask(config, chip, program, 1, "inference", quantize=quantize)
 
 
 def _ask(
-    config: Config, chip: Chip, name: str, devices: int, kind: str, quantize: str = ""
+    config: Config, chip: Chip, name: str, devices: int, kind: str, **more: Any
 ) -> StageReport:
     """Start the process that compiles, and return its report."""
     topology.require_compiler(chip)
@@ -151,8 +155,8 @@ def _ask(
         "name": name,
         "chip": chip.name,
         "devices": devices,
-        "quantize": quantize,
         "parent": os.getpid(),
+        **more,
     }
     with tempfile.TemporaryDirectory(prefix="pewm-plan-") as folder:
         asked, answered = Path(folder) / "request.json", Path(folder) / "report.json"
@@ -206,7 +210,7 @@ def main(asked: str, answered: str) -> None:
         if request["kind"] == "inference":
             report = _inference(config, request["name"], chip, request["quantize"])
         else:
-            report = _stage(config, request["name"], chip, request["devices"])
+            report = _stage(config, request["name"], chip, request["devices"], request["slices"])
         answer = dataclasses.asdict(report)
     except UserError as error:
         answer = {"error": str(error)}
@@ -228,7 +232,7 @@ def _load(name: str, file: str) -> None:
     spec.loader.exec_module(sys.modules[name])
 
 
-def _stage(config: Config, name: str, chip: Chip, count: int) -> StageReport:
+def _stage(config: Config, name: str, chip: Chip, count: int, slices: int) -> StageReport:
     """Trace and compile a stage, in the process for it."""
     import jax  # noqa: PLC0415 - only this process uses JAX
 
@@ -237,7 +241,8 @@ def _stage(config: Config, name: str, chip: Chip, count: int) -> StageReport:
     from pewm_jax.train import runs, sharding, step  # noqa: PLC0415
 
     (stage,) = (one for one in runs.planned(config) if one.name == name)
-    mesh = sharding.make_mesh(topology.devices(chip, count), config.train.mesh)
+    mesh = sharding.make_mesh(topology.devices(chip, count, slices), config.train.mesh)
+    chip = topology.of_slices(chip, count, slices)
     sizes = measure.MeshSizes(**{name: mesh.shape[name] for name in AXES})
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
     given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
@@ -297,7 +302,7 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
     from pewm_jax.plan import measure, program, suggest  # noqa: PLC0415
 
     sizes = measure.MeshSizes(**report.mesh)
-    began, cpu_began = time.monotonic(), time.process_time()
+    began, cpu_began = time.monotonic(), _processor_time()
     with tempfile.TemporaryDirectory(prefix="pewm-hlo-") as folder:
         # A TPU's compiled program cannot always be printed; what its compiler writes can be read.
         written: dict[str, str | bool] = (
@@ -313,9 +318,9 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
                 options = NO_TRITON
                 compiled = lowered.compile(compiler_options={**written, **options})
         except jax.errors.JaxRuntimeError as error:
-            seconds = time.monotonic() - began, time.process_time() - cpu_began
+            seconds = time.monotonic() - began, _processor_time() - cpu_began
             return _refused(report, str(error), seconds, options)
-        seconds = time.monotonic() - began, time.process_time() - cpu_began
+        seconds = time.monotonic() - began, _processor_time() - cpu_began
         text = _text(compiled, Path(folder))
     memory: Any = compiled.memory_analysis()
     arguments, temporary = measure.device_memory(compiled)
@@ -351,6 +356,11 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
     sent = (item for item in found.collectives if len(item.group) > 1)
     link_s = math.fsum(item.sent / suggest.rate(item.group, chip) for item in sent)
     return _timed(report, config, chip, link_s)
+
+
+def _processor_time() -> float:
+    """Return the processor time of this process and of the assemblers that it started."""
+    return math.fsum(os.times()[:4])
 
 
 def _text(compiled: Any, folder: Path) -> str:

@@ -155,7 +155,7 @@ def report(**changes):
 def test_the_plan_prints_every_stage_and_writes_the_numbers(monkeypatch, tmp_path):
     asked = []
 
-    def compile_stage(config, stage, chip, devices):
+    def compile_stage(config, stage, chip, devices, slices):
         asked.append((stage, chip.name, devices))
         return report(name=stage)
 
