@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -39,6 +40,9 @@ TRAINING, INFERENCE = "training", "inference"
 CHIPS = {TRAINING: ("h100", "v5p"), INFERENCE: ("h100", "a100", "v5e", "v6e")}
 """Chips of each table; the compilers of GPUs are faster."""
 DEVICES = 8
+MANY = (("v5p", 64, 4), ("v5e", 256, 1))
+"""Chip, number of devices and of slices: larger arrangements of the presets of ``LARGE``."""
+LARGE = ("pewm_2b", "pewm_5b")
 HEADS = {
     TRAINING: (
         *("model", "stage", "devices", "mesh", "memory of a device", "fits", "executed"),
@@ -62,6 +66,7 @@ class Piece:
         title: its description.
         chip: the kind of device.
         devices: their number.
+        slices: the number of slices that they make up.
     """
 
     table: str
@@ -70,6 +75,7 @@ class Piece:
     title: str
     chip: Chip
     devices: int
+    slices: int = 1
 
     @property
     def config(self) -> Config:
@@ -81,19 +87,23 @@ class Piece:
         """Return the name of the result, with all that it depends on."""
         compiler = topology.compiler(self.chip)
         settings = serialize.to_dict(self.config)
-        code = inputs_hash([settings, self.name, self.chip.name, self.devices, compiler])[:16]
-        return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{self.devices}-{code}"
+        many = f"{self.devices}x{self.slices}" if self.slices > 1 else str(self.devices)
+        code = inputs_hash([settings, self.name, self.chip.name, many, compiler])[:16]
+        return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{many}-{code}"
 
     def compile(self) -> StageReport:
         """Ask the chip's compiler."""
         if self.table == TRAINING:
-            return target_compiler.compile_stage(self.config, self.name, self.chip, self.devices)
+            return target_compiler.compile_stage(
+                self.config, self.name, self.chip, self.devices, self.slices
+            )
         return target_compiler.compile_inference(self.config, self.name, self.chip)
 
 
 def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:
-    """Yield the programs of a table."""
-    for chip in map(chips.named, options.chips or CHIPS[which]):
+    """Yield the programs of a table, those for many devices last."""
+    names = options.chips or CHIPS[which]
+    for chip in map(chips.named, names):
         for preset in options.presets:
             config = presets.load(preset)
             if which == INFERENCE:
@@ -102,6 +112,12 @@ def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:
                 continue
             for stage in runs.planned(config):
                 yield Piece(which, preset, stage.name, stage.title, chip, options.devices)
+    if which == TRAINING:
+        wanted = [one for one in MANY if not options.chips or one[0] in options.chips]
+        for (name, devices, slices), preset in itertools.product(wanted, LARGE):
+            chip = chips.named(name)
+            for stage in runs.planned(presets.load(preset)) if preset in options.presets else ():
+                yield Piece(which, preset, stage.name, stage.title, chip, devices, slices)
 
 
 def compiled(missing: list[Piece]) -> Iterator[tuple[Piece, dict[str, Any]]]:
@@ -119,8 +135,10 @@ def compiled(missing: list[Piece]) -> Iterator[tuple[Piece, dict[str, Any]]]:
 def row(piece: Piece, found: dict[str, Any]) -> list[str]:
     """Return a line of a table."""
     head = [piece.preset, piece.title.removeprefix("stage ")]
+    apart = f" in {piece.slices} slices" if piece.slices > 1 else ""
+    where = f"{piece.devices} × {piece.chip.name}{apart}"
     if "error" in found:
-        return [*head, f"{piece.devices} × {piece.chip.name}", found["error"]]
+        return [*head, where, found["error"]]
     report = StageReport(**found)
     peak = "more" if report.peak_bytes is None else gib(report.peak_bytes)
     bound = "" if report.roofline_s is None else duration(report.roofline_s)
@@ -133,7 +151,7 @@ def row(piece: Piece, found: dict[str, Any]) -> list[str]:
     fits = "yes" if report.fits else "**no**"
     return [
         *head,
-        f"{report.devices} × {report.chip}",
+        where,
         arranged({name: n for name, n in report.mesh.items() if n > 1}),
         f"{peak} of {gib(report.capacity_bytes)}",
         fits,
