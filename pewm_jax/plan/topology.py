@@ -34,8 +34,10 @@ ENVIRONMENT = {
     "TPU_SKIP_MDS_QUERY": "1",
     "TPU_WORKER_HOSTNAMES": "localhost",
     "TPU_ACCELERATOR_TYPE": "v5p-8",
+    "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",
 }
-"""Environment variables of the process that compiles: no devices, and no search for them."""
+"""Environment variables of the process that compiles: no devices, no search for them, and no lock
+that only one process may hold."""
 
 
 @dataclasses.dataclass(frozen=True)
