@@ -111,8 +111,9 @@ def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:
                     yield Piece(which, preset, name, inference.title(config, name), chip, 1)
                 continue
             for stage in runs.planned(config):
-                yield Piece(which, preset, stage.name, stage.title, chip, options.devices)
-    if which == TRAINING:
+                count = options.devices or DEVICES
+                yield Piece(which, preset, stage.name, stage.title, chip, count, options.slices)
+    if which == TRAINING and not options.devices:
         wanted = [one for one in MANY if not options.chips or one[0] in options.chips]
         for (name, devices, slices), preset in itertools.product(wanted, LARGE):
             chip = chips.named(name)
@@ -184,7 +185,10 @@ def arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--names", nargs="+", default=(), help="stages or programs, such as clip-50"
     )
-    parser.add_argument("--devices", type=int, default=DEVICES, help="devices of a training")
+    parser.add_argument(
+        "--devices", type=int, default=0, help=f"of a training; {DEVICES} and more if not given"
+    )
+    parser.add_argument("--slices", type=int, default=1, help="with --devices: slices of them")
     parser.add_argument("--folder", type=Path, default=Path("runs/plan-table"))
     parser.add_argument("--kept", action="store_true", help="compile nothing")
     parser.add_argument("--record", action="store_true", help="rewrite docs/scaling.md")
