@@ -12,12 +12,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.voxel_scores import house_of
 from pewm_jax.houses.floorplan import DOOR_TOP_M
-from pewm_jax.houses.generate import generate_house
+from pewm_jax.houses.generate import object_boxes
 from pewm_jax.houses.kinds import kind_of
 from pewm_jax.memory import class_grid
 from pewm_jax.types import WorldState
@@ -131,13 +130,10 @@ def _places(house: Mapping[str, Any], kind: str, floor_z: float, cell_m: float) 
 
 
 def _chairs(house: Mapping[str, Any], floor_z: float) -> Iterator[_Place]:
-    scene: trimesh.Scene = generate_house(int(house["seed"]))
-    for node in sorted(scene.graph.nodes_geometry):
+    for node, (low, high) in object_boxes(int(house["seed"])).items():
         if kind_of(node) not in CHAIRS or "face" in node:
             continue
-        transform, geometry = scene.graph[node]
-        points = trimesh.transform_points(scene.geometry[geometry].vertices, transform)
-        box = np.stack([points.min(0) - BESIDE_M, points.max(0) + BESIDE_M])
+        box = np.stack([low - BESIDE_M, high + BESIDE_M])
         box[0, 2] = floor_z + 0.02
         room = int(node.removeprefix("room").split("-")[0])
         yield _Place((room,), box.mean(0), box, "the chair is removed")

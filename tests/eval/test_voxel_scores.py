@@ -15,6 +15,8 @@ from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.eval import horizon, voxel_edits, voxel_report, voxel_scores
 from pewm_jax.eval.voxel_scores import UnseenCells
+from pewm_jax.houses.generate import object_boxes
+from pewm_jax.houses.kinds import FURNITURE, kind_of
 from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.report import labels
@@ -248,6 +250,9 @@ def test_an_edit_is_made_in_another_room_and_seen_later(episode):
         for place in found:
             assert (place.box_23[1] > place.box_23[0]).all(), kind
             assert (place.move is not None) == (kind == "wall")
+    boxes = object_boxes(int(house["seed"]))
+    assert any(kind_of(name) in FURNITURE for name in boxes)
+    assert all((box[1] >= box[0]).all() for box in boxes.values())
     plans = [voxel_edits.plan(MASKED, episode, kind) for kind in voxel_edits.KINDS]
     for plan in plans:
         if plan is not None:
