@@ -162,7 +162,8 @@ def form(how: Form, dtype: jnp.dtype) -> Form:
     if how != "auto":
         return how
     on_cpu: Form = "winograd" if dtype == jnp.float32 else "taps"
-    return {"cpu": on_cpu, "tpu": "stacked"}.get(target.current().platform, "volume")
+    forms: dict[str, Form] = {"cpu": on_cpu, "tpu": "stacked"}
+    return forms.get(target.current().platform, "volume")
 
 
 def _frames(
