@@ -157,7 +157,9 @@ def _lines(whole: Mapping[str, Any], frames: Mapping[str, Any], digits: int) -> 
         each = frames[name]["mean"]
         known = [(t, each[t - 1]) for t in AT if t <= len(each) and each[t - 1] is not None]
         at = "".join(f"  frame {t}: {value:.{digits}f}" for t, value in known)
-        out.append(f"  {name:<16} {'–' if mean is None else f'{mean:{digits + 4}.{digits}f}'}{span}{at}")
+        out.append(
+            f"  {name:<16} {'–' if mean is None else f'{mean:{digits + 4}.{digits}f}'}{span}{at}"
+        )
     return out
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import numpy as np
@@ -170,24 +170,12 @@ def choose_walks(
             "forward; collect walks with --test_policy follow, or evaluate another split "
             "(evaluate.split)."
         )
-    motion_PN3 = np.concatenate(motions)
-    scenes = np.array([choice.scene for choice in pool])
+    motion_PN3, scenes = np.concatenate(motions), [choice.scene for choice in pool]
+    moves, differ = motion_PN3, functools.partial(different_steps, units)
     if recorded:
-        record_PNA = np.concatenate(records)
-        spread_A = record_PNA.std((0, 1))
-        differ = functools.partial(different_records, spread_A=spread_A)
-        moves = record_PNA
-    else:
-        differ, moves = functools.partial(different_steps, units), motion_PN3
-    chosen, others, different = [], [], []
-    for _, place in sorted(ranked):
-        share_P = differ(moves, moves[place]).mean(1)
-        able = np.flatnonzero((scenes != scenes[place]) & (share_P >= LEAST_DIFFERENT))
-        if able.size and len(chosen) < clips:
-            other = int(np.random.default_rng([0, place]).choice(able))
-            chosen.append(place)
-            others.append(other)
-            different.append(share_P[other])
+        moves = np.concatenate(records)
+        differ = functools.partial(different_records, spread_A=moves.std((0, 1)))
+    chosen, others, different = _with_partners(sorted(ranked), scenes, moves, differ, clips)
     if not chosen:
         raise UserError(
             f"no clip of {where} has a partner with different actions: it must be from another "
@@ -201,6 +189,30 @@ def choose_walks(
         np.array(different),
         recorded,
     )
+
+
+def _with_partners(
+    ranked: Sequence[tuple[int, int]],
+    scenes: Sequence[str],
+    moves_PNA: np.ndarray,
+    differ: Callable[..., np.ndarray],
+    clips: int,
+) -> tuple[list[int], list[int], list[float]]:
+    """Return the places of at most ``clips`` clips, of their partners, and the shares of steps.
+
+    ``ranked`` are ranks and places in the pool of clips, whose actions are ``moves_PNA``.
+    """
+    houses = np.array(scenes)
+    chosen, others, different = [], [], []
+    for _, place in ranked:
+        share_P = differ(moves_PNA, moves_PNA[place]).mean(1)
+        able = np.flatnonzero((houses != houses[place]) & (share_P >= LEAST_DIFFERENT))
+        if able.size and len(chosen) < clips:
+            other = int(np.random.default_rng([0, place]).choice(able))
+            chosen.append(place)
+            others.append(other)
+            different.append(float(share_P[other]))
+    return chosen, others, different
 
 
 def _records(episode: Episode, steps_SN: np.ndarray, stride: int) -> np.ndarray:
