@@ -88,10 +88,12 @@ def check_motion(episode: Episode, depth_THW: np.ndarray | None, where: str) -> 
     posed = episode.info.get("poses") != "unknown"
     if posed:
         add("actions", _check_actions(episode))
+    add("states", _check_states(episode))
     if depth_THW is None:
         return found
     add("depth", _check_units(depth_THW))
-    if not found and posed and not episode.info.get("moving"):
+    moves = episode.info.get("moving") or episode.info.get("body")
+    if not found and posed and not moves:
         # Wrong poses or units would only be reported again.
         add("depth", _check_geometry(episode, depth_THW))
     return found
@@ -230,6 +232,13 @@ def _check_poses(episode: Episode) -> Found:
         if bottom[frame] > 1e-6:
             what = "the last row is not (0, 0, 0, 1)"
         yield int(frame), f"{what}: it must be a rigid transform."
+
+
+def _check_states(episode: Episode) -> Found:
+    if episode.states is None:
+        return
+    for frame in np.flatnonzero(~np.isfinite(episode.states).all(1))[:1]:
+        yield int(frame), "contains NaN or infinity."
 
 
 def _check_actions(episode: Episode) -> Found:

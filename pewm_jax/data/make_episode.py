@@ -16,6 +16,7 @@ import tyro
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.config.launch import is_address
 from pewm_jax.data import sensor
+from pewm_jax.data.agent import open_agent
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.moving import MovingHouse, moving_house, render_moving
 from pewm_jax.data.render import draw_blocks, render
@@ -34,7 +35,7 @@ HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
 UNRECORDED = VoxelsConfig()
-HANDHELD = 3
+HANDHELD, BODY = 3, 4
 """Number that is folded into the seed of hand-held cameras."""
 
 
@@ -84,6 +85,10 @@ class CollectConfig:
     """Also write instance ids, and the names of the instances."""
     moving: bool = False
     """Generated houses have doors that open as the agent approaches, and patrolling robots."""
+    body: Literal["", "humanoid"] = ""
+    """Body of the agent: `humanoid` has 25 degrees of freedom, of which two are walking. It is seen
+    by the camera on its head, which is camera_height above the floor when it stands upright. It
+    pauses and moves its arms; actions are the angles of its joints at the next frame."""
     voxels: VoxelsConfig = UNRECORDED
     episodes_per_house: int = 1
     """Episodes recorded in one house before the next is generated."""
@@ -150,6 +155,7 @@ class CollectConfig:
                 f"--camera-height is {self.camera_height}: with --moving use "
                 f"{ROBOT_HEIGHT_M + HEADROOM_M:g} m or more, to be above the robots."
             )
+        self._check_body()
         for field in () if self.voxels.record else dataclasses.fields(self.voxels):
             value = getattr(self.voxels, field.name)
             if value != field.default:
@@ -159,6 +165,18 @@ class CollectConfig:
                 "--ids records the instances of the house, which --voxels.pictures cells does not "
                 "show: leave out one of the two."
             )
+
+    def _check_body(self) -> None:
+        for flag, given in (
+            ("continuous", self.continuous),
+            ("handheld", self.handheld > 0),
+            ("voxels", self.voxels.record),
+        ):
+            if self.body and given:
+                raise ConfigError(
+                    f"--{flag} does not go together with --body {self.body}: leave out one of the "
+                    "two."
+                )
 
     @property
     def actions(self) -> ActionConfig:
@@ -180,8 +198,9 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
         del settings["test_policy"]
     if split != "train" or not config.handheld:
         del settings["handheld"]
-    if not config.moving:
-        del settings["moving"]
+    for name in ("moving", "body"):
+        if not getattr(config, name):
+            del settings[name]
     if settings["voxels"]["pictures"] == UNRECORDED.pictures:
         del settings["voxels"]["pictures"]
     if not settings["voxels"].pop("record"):
@@ -221,10 +240,11 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     else:
         scene, grid = _house(house_seed(config, split, index), config.camera_height)
     policy: Policy = config.test_policy if split == "revisit" else config.policy
+    agent = open_agent(config.body, config.camera_height) if config.body else None
     walk = make_trajectory(
         grid,
         config.actions,
-        config.frames,
+        config.frames if agent is None else agent.frames(config.frames),
         np.random.default_rng([config.seed, SPLITS.index(split), index]),
         policy=policy,
         turn_around=config.turn_around,
@@ -233,6 +253,11 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     size = config.size, config.size
     by_hand = _hand(config, split, index)
     camera, height = _filmed(config, walk, grid.floor_z, by_hand)
+    states = None
+    if agent is not None:
+        rng = np.random.default_rng([config.seed, SPLITS.index(split), index, BODY])
+        walk, states = agent.act(walk, config.frames, rng)
+        camera = agent.camera(walk.planar_T3, states, camera.intrinsics_4, grid.floor_z)
     pose = np.asarray(camera.world_from_camera)
     parts = None if moving is None else moving.poses(walk.planar_T3[:, :2])
     voxels = None
@@ -245,6 +270,11 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         seen = render_moving(moving, parts, camera, *size)
     else:
         seen = render(scene, camera, *size)
+    bodies = None
+    if agent is not None and states is not None:
+        first = len(scene.objects) + (0 if moving is None else len(moving.moves))
+        agent.render_over(seen, walk.planar_T3, states, camera, grid.floor_z, first)
+        bodies = {"name": config.body, "scale": round(agent.scale, 6), "ids": agent.ids(first)}
     recorded = sensor.record(by_hand, seen.rgb_THWC, seen.depth_THW, pose)
     arrays = EpisodeArrays(
         recorded.rgb_THWC,
@@ -255,6 +285,7 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         walk.action_ids,
         seen.ids_THW if config.ids else None,
         voxels,
+        states,
     )
     info: dict[str, Any] = {
         "policy": policy,
@@ -266,6 +297,7 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     optional = {
         "objects": list(scene.objects) if config.ids else None,
         "moving": config.moving or None,
+        "body": bodies,
         "handheld": by_hand is not None or None,
         "pictures": None if _usual_pictures(config) else config.voxels.pictures,
         "return_frame": walk.return_frame,
