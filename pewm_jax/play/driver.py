@@ -242,8 +242,8 @@ class Driver:
                 self._engine = self._load()
         engine = self._engine
         with self._busy("looking around"):
-            place = places.open_place(start, *engine.size)
             places.require_shown(engine.model, start)
+            place = places.open_place(start, *engine.size, places.blocks_of(engine.model))
             begun = session.begin(engine, place, start.seed)
         self._end_film()
         self._before.clear()

@@ -13,12 +13,15 @@ import numpy as np
 
 from pewm_jax.config import UserError, World
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.episodes import DEPTH_LIMIT_M
 from pewm_jax.data.importer import ImportConfig, import_recording
 from pewm_jax.data.loader import require_recorded, require_same_cells
 from pewm_jax.data.navigation import NavGrid, is_free, sample_free
 from pewm_jax.data.recordings import read_recording
-from pewm_jax.data.render import render
+from pewm_jax.data.render import draw_blocks, render
 from pewm_jax.data.simulator import Simulator, move, open_simulator
+from pewm_jax.data.voxelise import record_voxels
+from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, Frames
@@ -37,16 +40,22 @@ class StartPoint:
         frames: S ≥ 1 frames of the model's size, rgb uint8; the last one is the present.
         planar_3: x, y, yaw of the present in a house or mesh, else None.
         simulator: the house or mesh, which provides the ground truth and collisions, else None.
+        blocks: the cells as which the house or mesh is shown; None for its surfaces.
     """
 
     name: str
     frames: Frames
     planar_3: np.ndarray | None = None
     simulator: Simulator | None = None
+    blocks: VoxelsConfig | None = None
 
 
-def open_place(start: Start, height: int, width: int) -> StartPoint:
+def open_place(
+    start: Start, height: int, width: int, blocks: VoxelsConfig | None = None
+) -> StartPoint:
     """Open the scene in which a drive starts, for images of this size.
+
+    Houses and meshes are shown as ``blocks``, if they are given.
 
     Raises:
         UserError: the scene does not exist or cannot be used.
@@ -68,7 +77,25 @@ def open_place(start: Start, height: int, width: int) -> StartPoint:
     around = np.tile(planar, (LOOKS, 1))
     around[:-1, 2] += 2 * np.pi * np.arange(1, LOOKS) / LOOKS
     name = Path(start.scene).name if start.scene else f"house {start.house}"
-    return StartPoint(name, simulator.frames(around), planar, simulator)
+    poses = np.stack([simulator.world_from_camera(pose) for pose in around])
+    camera = Camera(np.tile(simulator.intrinsics_4, (LOOKS, 1)), poses)
+    seen = _rendered(simulator, blocks, camera, height, width)
+    return StartPoint(name, seen, planar, simulator, blocks)
+
+
+def blocks_of(model: World) -> VoxelsConfig | None:
+    """Return the cells as which a world's places are shown; None if it was trained on surfaces."""
+    memory: Any = getattr(model, "memory", None)
+    if not getattr(memory, "CLASSES", False) or memory.pictures != "cells":
+        return None
+    return VoxelsConfig(
+        record=True,
+        cell=memory.cell_m[0],
+        side=memory.recorded,
+        kinds=memory.kinds,
+        colours=memory.colours,
+        pictures="cells",
+    )
 
 
 def require_shown(model: World, start: Start) -> None:
@@ -84,11 +111,10 @@ def require_shown(model: World, start: Start) -> None:
         return
     if start.episode:
         require_same_cells(model, EpisodeSource(Path(start.episode))[start.number])
-    elif memory.pictures == "cells":
+    elif start.recording and memory.pictures == "cells":
         raise UserError(
-            "This world was trained on images of blocks, but generated houses, meshes and "
-            "recordings "
-            "show surfaces: start with an episode of its data, such as --episode "
+            "This world was trained on images of blocks, but recordings show surfaces: start in a "
+            "generated house or a mesh, or with an episode of its data, such as --episode "
             "data/persist/revisit."
         )
 
@@ -98,8 +124,22 @@ def truth(place: StartPoint, camera: Camera, height: int, width: int) -> Frames 
     if place.simulator is None:
         return None
     host = Camera(np.asarray(camera.intrinsics_4), np.asarray(camera.world_from_camera))
-    seen = render(place.simulator.scene, host, height, width)
-    return Frames(seen.rgb_THWC, seen.depth_THW, host)
+    return _rendered(place.simulator, place.blocks, host, height, width)
+
+
+def _rendered(
+    simulator: Simulator, blocks: VoxelsConfig | None, camera: Camera, height: int, width: int
+) -> Frames:
+    """Return what (T,) cameras see of a house or mesh, as blocks or as surfaces."""
+    scene = simulator.scene
+    if blocks is None:
+        seen = render(scene, camera, height, width)
+        depth = np.where(seen.depth_THW <= DEPTH_LIMIT_M, seen.depth_THW, np.float32(0))
+        return Frames(seen.rgb_THWC, depth, camera)
+    eye = np.asarray(camera.world_from_camera)[:, :3, 3]
+    voxels = record_voxels(blocks, scene, float(simulator.grid.floor_z), eye)
+    seen = draw_blocks(voxels, camera, height, width)
+    return Frames(seen.rgb_THWC, seen.depth_THW, camera)
 
 
 def walk(
