@@ -38,6 +38,8 @@ class Settings:
     """Sampling steps."""
     highest: tuple[float, ...] = (20.0,)
     """Highest noise levels."""
+    lowest: tuple[float, ...] = (0.002,)
+    """Lowest noise levels."""
     rendered: tuple[float, ...] = (0.0,)
     """Noise levels down to which rendered latents are kept."""
     clips: int = 48
@@ -54,14 +56,20 @@ def main(settings: Settings) -> None:
     noise = loaded.config.model.noise
     if not isinstance(noise, EDMConfig):
         raise UserError(f"{settings.run} has noise.kind {noise.kind}: a run with edm is needed.")
-    combinations = list(itertools.product(settings.steps, settings.highest, settings.rendered))
+    combinations = list(
+        itertools.product(settings.steps, settings.highest, settings.lowest, settings.rendered)
+    )
     rows = []
     with Meter("sampling", len(combinations), "evaluations") as meter:
-        for steps, highest, rendered in combinations:
+        for steps, highest, lowest, rendered in combinations:
             changed = dataclasses.replace(
-                noise, sample_steps=steps, sigma_max=highest, rendered_until=rendered
+                noise,
+                sample_steps=steps,
+                sigma_max=highest,
+                sigma_min=lowest,
+                rendered_until=rendered,
             )
-            out = settings.out / f"{steps}-{highest:g}-{rendered:g}"
+            out = settings.out / f"{steps}-{highest:g}-{lowest:g}-{rendered:g}"
             evaluate.evaluate(
                 settings.run,
                 out=out,
@@ -76,10 +84,10 @@ def main(settings: Settings) -> None:
                 mirror=0,
                 fvd="on",
             )
-            rows.append(_row((steps, highest, rendered), out / METRICS))
+            rows.append(_row((steps, highest, lowest, rendered), out / METRICS))
             print(" | ".join(rows[-1]), flush=True)
             meter.advance(1)
-    head = ("steps", "σ_max", "kept until", "PSNR seen", "PSNR never seen", "PSNR all")
+    head = ("steps", "σ_max", "σ_min", "kept until", "PSNR seen", "PSNR never seen", "PSNR all")
     head = (*head, "LPIPS seen", "LPIPS never seen", "LPIPS all", "FVD", "KVD", "KVD never seen")
     table = record.table(head, rows)
     print(table)

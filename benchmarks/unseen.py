@@ -81,8 +81,10 @@ def views(settings: Settings) -> tuple[list[View], int]:
     """Return the views that are shown, and from how many they were taken.
 
     Raises:
-        UserError: no view has as many never-seen pixels.
+        UserError: no view has as many never-seen pixels, or there is nothing to compare.
     """
+    if settings.seeds < 2:
+        raise UserError(f"--seeds is {settings.seeds}: imagined views are compared, use 2 or more.")
     loaded = loaded_run.open_run(settings.run)
     data = dataclasses.replace(loaded.config.data, path=str(settings.data))
     how = dataclasses.replace(loaded.config.evaluate, split=settings.split)
@@ -140,7 +142,7 @@ def _rendered(config: Any, runner: ModelRunner, batch: Batch) -> np.ndarray:
         colours = (view.features_THWF[0, ..., :MAP_CHANNELS] + 1) / 2
         return jnp.where(view.seen_THW[0, ..., None], colours, GREY)
 
-    return np.asarray(jax.jit(jax.vmap(one))(state.memory, last))
+    return np.asarray(jax.jit(jax.vmap(one))(state.map, last))
 
 
 def _view(batch: Batch, rendered: np.ndarray, imagined: list[np.ndarray], row: int) -> View:
