@@ -251,6 +251,7 @@ class Conditioner(Settings):
         SHARDING: rules over ``control/…`` paths.
         actions: A, the numbers of an action that it needs; 0 where cameras are enough.
         state: numbers of the agent's state at the first frame that it needs; 0 for none.
+        body: the body whose degrees of freedom the actions are; "" for none that is known.
         rate: factor of the learning rate of its parameters.
     """
 
@@ -259,6 +260,7 @@ class Conditioner(Settings):
     MODULATES: ClassVar[bool] = False
     actions: Any = 0
     state: Any = 0
+    body: Any = ""
     rate: Any = 1.0
 
     def channels(self, model: Any) -> int:

@@ -78,7 +78,7 @@ class ModulationConfig(Conditioner):
     frame, which modulates the layers (the paper). `attention`: as further tokens after those of the
     text, one per latent frame, where the backbone attends to any number of tokens. `channels`:
     repeated over height and width, as further input channels."""
-    body: Literal["", "humanoid"] = ""
+    body: Literal["", "humanoid"] = ""  # type: ignore[assignment]
     """The body whose degrees of freedom the actions are (`data collect --body`): the viewer then
     has a slider for each of them. Empty: the actions are of no known body."""
     rays: bool = False
