@@ -23,7 +23,7 @@ from pewm_jax.eval.metrics.selection import select_lpips, select_scs
 
 def main() -> None:
     """Measure a run."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("run", help="folder of a finished training")
     parser.add_argument("--data", help="data folder; by default the run's")
     parser.add_argument("--split", help="folder inside it; by default the run's evaluate.split")

@@ -25,7 +25,7 @@ def config() -> Config:
         low=tuple(HUMANOID.low.tolist()),
         high=tuple(HUMANOID.high.tolist()),
         angles=(),
-        body=HUMANOID.name,
+        body="humanoid",
     )
     return dataclasses.replace(
         base,

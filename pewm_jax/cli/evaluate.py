@@ -23,6 +23,7 @@ JOIN = Join()
 SCORED = (
     *("split", "clips", "seeds", "chain", "stride", "videos", "video_clips", "batch"),
     *("none", "lpips", "protocol", "fvd", "mirror", "src", "scs", "quantize"),
+    *("long", "long_frames", "beside", "mechanisms"),
 )
 """Settings of ``EvalConfig`` that are flags of ``evaluate``."""
 CHOSEN = ("split", "clips", "seeds", "chain", "stride", "video_clips")

@@ -389,6 +389,17 @@ class EvalConfig:
     quantize: Literal["", "int8", "fp8"] = ""
     """Keep the weights of the denoiser in 8 bits, with one scale for each output channel: `int8` or
     `fp8`; if empty, they stay as they are. The report has a folder of its own."""
+    long: str = ""
+    """Data set with long walks in held-out houses, for worlds of voxels: after each walk it is
+    measured what is left of what was observed before it (`pewm-jax data collect --voxels …
+    --frames 632`); if empty, that is left out."""
+    long_frames: int = 600
+    """Frames imagined in each long walk."""
+    beside: tuple[str, ...] = ()
+    """Other worlds (folders of runs, or names of models that ship) that imagine the long walks."""
+    mechanisms: Literal["off", "on"] = "off"
+    """Add rows to the scores of a world of voxels, each with one of its mechanisms switched off:
+    `persistence_logit`, `empty_prior`, `observation_logit`, and the revision of guesses."""
     protocol: str = ""
     """File written by `pewm-jax protocol` before training: the clips that are scored, with their
     context, motion and noise; it stands above the settings here. If empty, or `off`, clips are
@@ -402,7 +413,7 @@ class EvalConfig:
             len(set(self.seeds)) == len(self.seeds),
             "evaluate.seeds has one of them twice: the same noise would count twice.",
         )
-        counts = ("clips", "chain", "stride", "videos", "video_clips", "batch")
+        counts = ("clips", "chain", "stride", "videos", "video_clips", "batch", "long_frames")
         require_positive(self, "evaluate", *counts)
         require(
             self.mirror >= -1,

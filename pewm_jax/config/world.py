@@ -146,6 +146,8 @@ class Capabilities:
             memory can be compared.
         silent_actions: whether actions act through the parameters ``control``, so that a model
             whose ``control`` is zero ignores actions.
+        voxels: whether its state is a grid of class ids (``memory.class_grid``), which is compared
+            with recorded grids.
     """
 
     memory: bool = False
@@ -159,6 +161,7 @@ class Capabilities:
     coverage: bool = False
     stage_without_memory: bool = False
     silent_actions: bool = False
+    voxels: bool = False
 
 
 METHODS = {"edits": ("erase", "move"), "points": ("memory_points",), "coverage": ("coverage",)}

@@ -130,16 +130,23 @@ class FrameFlowConfig(FlowConfig):
     """The noise s that is left at t = 0."""
     context_noise: float = 0.02
     """Time of the frames that are given; published: 0.02 for voxels, 0.1 for pixels."""
+    history: float = 0.0
+    """Share of the frames in training at the time of given frames, so that the others learn to read
+    such frames; other times are rarely as small. It needs `per_frame`; 0 as published."""
 
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
-        names, hint = ("smallest", "context_noise"), "0 or more, below 1"
+        names, hint = ("smallest", "context_noise", "history"), "0 or more, below 1"
         require_fields(self, "noise", lambda value: 0 <= value < 1, hint, *names)
         require(
             self.times != "ends" or (self.per_frame and self.sample_steps == 1),
             f"noise.times is ends with noise.per_frame {self.per_frame} and noise.sample_steps "
             f"{self.sample_steps}: use per_frame true and 1 step, or other times.",
+        )
+        require(
+            self.per_frame or not self.history,
+            f"noise.history is {self.history} and noise.per_frame false: use true, or 0.",
         )
 
     def draw(self, key: Array, batch: int, frames: int) -> Array:
@@ -148,7 +155,11 @@ class FrameFlowConfig(FlowConfig):
             ended = jax.random.bernoulli(key, shape=(batch, frames))
             return jnp.where(ended, 1.0, self.context_noise)
         drawn = self if self.shifted_times else dataclasses.replace(self, shift=1.0)
-        return FlowConfig.draw(drawn, key, batch, frames)
+        times = FlowConfig.draw(drawn, key, batch, frames)
+        if not (self.history and self.per_frame):
+            return times
+        past = jax.random.bernoulli(jax.random.fold_in(key, 1), self.history, times.shape)
+        return jnp.where(past, self.context_noise, times)
 
     def corrupt(self, x0: Array, noise: Array, time_B: Array) -> Array:
         """Return (1 − t) x0 + (s + (1 − s) t) ε."""

@@ -298,6 +298,8 @@ def fingerprint(
     settings = to_dict(config)
     for key in ("seeds", "videos", "none", "lpips", "protocol", "fvd", "mirror", "src", "scs"):
         settings["evaluate"].pop(key)
+    for key in ("long", "long_frames", "beside", "mechanisms"):
+        settings["evaluate"].pop(key)
     for key in ("train", "data"):
         settings.pop(key)
     if not settings["evaluate"]["quantize"]:

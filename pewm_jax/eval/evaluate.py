@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,7 @@ from pewm_jax.config import Config, UserError
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.data.loader import require_recorded
 from pewm_jax.eval import loaded_run as runs
-from pewm_jax.eval import reproject, results, steering
+from pewm_jax.eval import reproject, results, steering, voxel_report
 from pewm_jax.eval.clips import ClipChoice, fingerprint, lacking_geometry, steered_by_record
 from pewm_jax.eval.gallery import make_gallery
 from pewm_jax.eval.long_rollouts import LongRollouts, roll_long
@@ -62,7 +63,7 @@ def override(config: Config, **changes: Any) -> Config:
     """
     changes = {key: value for key, value in changes.items() if value is not None}
     steps, data = changes.pop("steps", None), changes.pop("data", None)
-    for name in ("none", "lpips", "protocol", "fvd", "scs"):
+    for name in ("none", "lpips", "protocol", "fvd", "scs", "long"):
         if name in changes:
             changes[name] = str(changes[name])
     if steps is not None:
@@ -112,7 +113,7 @@ def evaluate(
     config, folder = job.config, Path(out) if out else runs.report_folder(loaded, job.config)
     processes.barrier("evaluate: begin")
     complete = is_complete(
-        folder, config, job.fingerprint, job.none_weights, job.metrics.hashes, job.validation_hash
+        folder, config, job.fingerprint, job.none_weights, job.compared, job.validation_hash
     )
     processes.barrier("evaluate: decided")  # nobody may write before all have checked
     if complete:
@@ -176,6 +177,13 @@ class _Job:
         """Return the hash of the weights of ``none``, or ""."""
         return self.none.weights_hash if self.none else ""
 
+    @functools.cached_property
+    def compared(self) -> dict[str, Any]:
+        """Return the entries of the protocol that optional metrics depend on."""
+        if not self.config.model.capabilities.voxels:
+            return self.metrics.hashes
+        return {**self.metrics.hashes, "voxels": voxel_report.settings_of(self.config)}
+
     @property
     def fingerprint(self) -> str:
         """Return the hash of all that scores depend on."""
@@ -235,6 +243,7 @@ class _Measured(NamedTuple):
     mirror: Mirror | None
     coverage: dict[str, float] | None
     steered: steering.Steered | None
+    voxels: dict[str, Any] | None
     about: dict[str, str | None]
 
 
@@ -262,8 +271,9 @@ def _measure(
         steered, about_steering = steering.score(
             config, job.loaded.params, episodes, clips, cache, log, measures
         )
+    voxels = voxel_report.score(config, job.loaded.params, episodes, cache, log, metrics.i3d)
     about = {"mirror": way_out(config, rollouts)[1], "steering": about_steering}
-    return _Measured(scored, long, mirrored, covered, steered, about)
+    return _Measured(scored, long, mirrored, covered, steered, voxels, about)
 
 
 def _metrics(
@@ -274,6 +284,7 @@ def _metrics(
     metrics = compute_metrics(job.config, *measured[:3], i3d, consistency)
     metrics["coverage"] = measured.coverage
     metrics["steering"] = measured.steered and measured.steered.facts()
+    metrics["voxels"] = measured.voxels
     wanted = job.config.model.batch_spec.actions
     if steered_by_record(job.config.model):
         metrics["protocol"]["motion"] = f"the recorded actions of {wanted} numbers"
@@ -288,7 +299,7 @@ def _metrics(
         **job.metrics.about,
         "lpips_name": job.metrics.lpips_name,
         **measured.about,
-        **job.metrics.hashes,
+        **job.compared,
         "weights_sha256": job.loaded.weights_hash,
         "dataset_sha256": job.data_hash,
         "protocol_sha256": protocol.sha256,

@@ -125,23 +125,43 @@ def imagine_walks(
     Without ``memory`` each clip is imagined only from the last frame of the previous one. With
     ``known`` a ``persist`` world starts from the recorded grid of the present frame.
     """
+    if known:
+        state = _start_from_grids(config, params, walks)
+    else:
+        state = start_walks(config, params, walks)
+    actions = np.stack([walk.actions_T3 for walk in walks])
+    return imagine_actions(config, params, state, actions, memory=memory, label=label)[0]
+
+
+def start_walks(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> Any:
+    """Return the states of worlds that have observed the frames before each walk."""
+    start = jax.jit(jax.vmap(functools.partial(worlds.start, config.model), (None, 0)))
+    return start(params, _stack([walk.context for walk in walks]))
+
+
+def imagine_actions(
+    config: Config,
+    params: Params,
+    state: Any,
+    actions_BT3: np.ndarray,
+    *,
+    memory: bool = True,
+    label: str = "imagining",
+) -> tuple[np.ndarray, Any]:
+    """Imagine worlds from their states; return (B, T, H, W, 3) uint8 colours and the states."""
     model = config.model
     each = CHUNK if memory else model.clip.frames - 1
     imagine = functools.partial(worlds.imagine, model, memory=memory)
     imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
-    if known:
-        state = _start_from_grids(config, params, walks)
-    else:
-        start = jax.jit(jax.vmap(functools.partial(worlds.start, model), (None, 0)))
-        state = start(params, _stack([walk.context for walk in walks]))
-    actions = np.stack([walk.actions_T3 for walk in walks])
-    keys = jax.random.split(jax.random.key(0), len(walks))
+    keys = jax.random.split(jax.random.key(0), len(actions_BT3))
     return _in_chunks(
-        actions.shape[1],
+        actions_BT3.shape[1],
         each,
         label,
         state,
-        lambda state, at: imagine(params, state, actions[:, at : at + each], _fold_keys(keys, at)),
+        lambda state, at: imagine(
+            params, state, actions_BT3[:, at : at + each], _fold_keys(keys, at)
+        ),
     )
 
 
@@ -164,7 +184,7 @@ def render_bound(config: Config, params: Params, walks: Sequence[RecordedWalk]) 
         return render(params, state, *part, _fold_keys(keys, at))
 
     count = walks[0].actions_T3.shape[0]
-    return _in_chunks(count, CHUNK, "rendering true voxels", state, made)
+    return _in_chunks(count, CHUNK, "rendering true voxels", state, made)[0]
 
 
 def _start_from_grids(config: Config, params: Params, walks: Sequence[RecordedWalk]) -> Any:
@@ -216,14 +236,14 @@ def distances(
 
 def _in_chunks(
     count: int, each: int, label: str, state: Any, make: Callable[[Any, int], Any]
-) -> np.ndarray:
+) -> tuple[np.ndarray, Any]:
     parts = []
     with Meter(label, count, "frames") as meter:
         for at in range(0, count, each):
             state, frames = make(state, at)
             parts.append(as_bytes(np.asarray(frames.rgb_THWC)))
             meter.advance(min(each, count - at))
-    return np.concatenate(parts, 1)
+    return np.concatenate(parts, 1), state
 
 
 def _stack(trees: Sequence[Any]) -> Any:

@@ -62,6 +62,17 @@ def generate_house(seed: int) -> trimesh.Scene:
     return scene
 
 
+def object_boxes(seed: int) -> dict[str, np.ndarray]:
+    """Return the (2, 3) lowest and highest corners, metres, of the parts of a seed's house."""
+    scene = generate_house(seed)
+    found = {}
+    for node in sorted(scene.graph.nodes_geometry):
+        transform, geometry = scene.graph[node]
+        points = trimesh.transform_points(scene.geometry[geometry].vertices, transform)
+        found[node] = np.stack([points.min(0), points.max(0)])
+    return found
+
+
 def _draw(rng: np.random.Generator) -> trimesh.Scene | None:
     """Draw one house; return None if one of its rooms cannot be reached."""
     plan = draw_plan(rng)

@@ -1,11 +1,13 @@
 """A grid of class ids: the state of the world ``persist`` as a memory that can be edited.
 
 A cell holds −1 if it is unknown, 0 if it is empty, else a class. The networks of the world predict
-the cells from observed frames (``worlds.persist``).
+the cells from observed frames (``worlds.persist``). A mask beside the classes states where a cell
+comes from: it was observed in a real frame (or given, or edited), an imagined frame has shown it,
+or neither: then it is a guess, or unknown.
 
 A box is (2, 3), its lower and upper corner in the world, metres; a cell belongs to it if its centre
 lies in it. A transform is a rigid 4×4 matrix from old to new positions. Erased cells are empty, not
-unknown. All functions are pure and jittable with ``config`` static.
+unknown. Edited cells count as observed. All functions are pure and jittable with ``config`` static.
 """
 
 from __future__ import annotations
@@ -32,6 +34,8 @@ UNKNOWN = -1
 """The id of an unknown cell."""
 EMPTY = 0
 """The id of an empty cell."""
+GUESSED, SHOWN, OBSERVED = 0, 1, 2
+"""Values of the mask: unknown or a guess, shown by an imagined frame, observed (given, edited)."""
 
 
 @jax.tree_util.register_dataclass
@@ -43,11 +47,28 @@ class ClassGrid:
         classes_XYZ: (X, Y, Z) int16 class ids; ``UNKNOWN`` where nothing is known.
         low_3: (3,) float32 world position of the lowest corner, metres.
         history: what the world's networks keep of earlier frames; None outside a world.
+        mask_XYZ: (X, Y, Z) uint8 ``GUESSED``, ``SHOWN`` or ``OBSERVED``; None if it is not kept.
     """
 
     classes_XYZ: Array
     low_3: Array
     history: Any = None
+    mask_XYZ: Array | None = None
+
+
+def observed(grid: ClassGrid) -> Array:
+    """Return (X, Y, Z) int8: 1 where a cell was observed free, 2 observed filled, 0 unknown.
+
+    Raises:
+        UserError: the grid has no mask.
+    """
+    if grid.mask_XYZ is None:
+        raise UserError(
+            "this grid has no mask of observed cells: use the map of a world's state, or "
+            "GridConfig.empty."
+        )
+    filled = jnp.where(grid.classes_XYZ > EMPTY, jnp.int8(2), jnp.int8(1))
+    return jnp.where(grid.mask_XYZ == OBSERVED, filled, jnp.int8(0))
 
 
 def place(config: Memory, grid: ClassGrid, box_23: Array, number: int | Array) -> ClassGrid:
@@ -64,8 +85,7 @@ def place(config: Memory, grid: ClassGrid, box_23: Array, number: int | Array) -
                 f"place() got the class {number}: use an id of the table, 1 to {count - 1}, or 0 "
                 "for nothing."
             )
-    inside = _within(config, grid, box_23)
-    return _with(grid, jnp.where(inside, jnp.asarray(number, jnp.int16), grid.classes_XYZ))
+    return _with(grid, _within(config, grid, box_23), jnp.asarray(number, jnp.int16))
 
 
 def erase(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
@@ -85,7 +105,7 @@ def copy(config: Memory, grid: ClassGrid, box_23: Array) -> ClassGrid:
     """
     inside = _within(config, grid, box_23) & (grid.classes_XYZ > EMPTY)
     kept = jnp.where(inside, grid.classes_XYZ, jnp.int16(UNKNOWN))
-    return dataclasses.replace(grid, classes_XYZ=kept, history=None)
+    return dataclasses.replace(grid, classes_XYZ=kept, history=None, mask_XYZ=None)
 
 
 def paste(
@@ -109,7 +129,7 @@ def paste(
     x, y, z = jnp.where(inside[:, None], cell_N3, 0).T
     found = jnp.where(inside, piece.classes_XYZ[x, y, z], jnp.int16(UNKNOWN))
     found = found.reshape(grid.classes_XYZ.shape)
-    return _with(grid, jnp.where(found > EMPTY, found, grid.classes_XYZ))
+    return _with(grid, found > EMPTY, found)
 
 
 def move(
@@ -143,8 +163,12 @@ def _within(config: Memory, grid: ClassGrid, box_23: Array) -> Array:
     return cells.within(points, jnp.ones(points.shape[:3], bool), box_23)
 
 
-def _with(grid: ClassGrid, classes_XYZ: Array) -> ClassGrid:
-    return dataclasses.replace(grid, classes_XYZ=classes_XYZ)
+def _with(grid: ClassGrid, changed_XYZ: Array, classes: Array) -> ClassGrid:
+    """Return a grid with other classes in some cells, which count as observed: an edit stays."""
+    cells_XYZ, mask = jnp.where(changed_XYZ, classes, grid.classes_XYZ), grid.mask_XYZ
+    if mask is not None:
+        mask = jnp.where(changed_XYZ, jnp.uint8(OBSERVED), mask)
+    return dataclasses.replace(grid, classes_XYZ=cells_XYZ, mask_XYZ=mask)
 
 
 def names(config: GridConfig) -> tuple[str, ...]:
@@ -242,7 +266,8 @@ class GridConfig(Memory):
         middle = jnp.round(centre[:2] / cell) * cell  # on the lattice of recorded grids
         low_xy = middle - np.asarray(self.cells[:2]) // 2 * cell
         unknown = jnp.full(self.cells, UNKNOWN, jnp.int16)
-        return ClassGrid(unknown, jnp.concatenate([low_xy, low_z[None]]))
+        mask = jnp.full(self.cells, GUESSED, jnp.uint8)
+        return ClassGrid(unknown, jnp.concatenate([low_xy, low_z[None]]), mask_XYZ=mask)
 
     def to_points(self, model: AssembledModel, memory: ClassGrid) -> tuple[Array, Array, Array]:
         """Return centres, colours in [−1, 1] and occupancy of all cells."""

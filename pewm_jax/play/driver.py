@@ -256,8 +256,9 @@ class Driver:
                 self._engine = self._load()
         engine = self._engine
         with self._busy("looking around"):
-            place = places.open_place(start, *engine.size, engine.body)
             places.require_shown(engine.model, start)
+            blocks = places.blocks_of(engine.model)
+            place = places.open_place(start, *engine.size, blocks, engine.body)
             begun = session.begin(engine, place, start.seed)
         self._end_film()
         self._before.clear()

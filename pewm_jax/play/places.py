@@ -15,12 +15,15 @@ from pewm_jax.bodies.humanoid import BODIES
 from pewm_jax.config import UserError, World
 from pewm_jax.data.agent import Agent, open_agent
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.episodes import DEPTH_LIMIT_M
 from pewm_jax.data.importer import ImportConfig, import_recording
 from pewm_jax.data.loader import require_recorded, require_same_cells
 from pewm_jax.data.navigation import NavGrid, is_free, sample_free
 from pewm_jax.data.recordings import read_recording
-from pewm_jax.data.render import render
+from pewm_jax.data.render import draw_blocks, render
 from pewm_jax.data.simulator import Simulator, move, open_simulator
+from pewm_jax.data.voxelise import record_voxels
+from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import resize_intrinsics
 from pewm_jax.play.settings import Start
 from pewm_jax.types import Camera, Frames
@@ -39,6 +42,7 @@ class StartPoint:
         frames: S ≥ 1 frames of the model's size, rgb uint8; the last one is the present.
         planar_3: x, y, yaw of the present in a house or mesh, else None.
         simulator: the house or mesh, which provides the ground truth and collisions, else None.
+        blocks: the cells as which the house or mesh is shown; None for its surfaces.
         agent: the body of the agent, if its degrees of freedom steer the model.
         state_A: its state at the present frame.
         floor_z: height of the floor below it, metres.
@@ -48,15 +52,19 @@ class StartPoint:
     frames: Frames
     planar_3: np.ndarray | None = None
     simulator: Simulator | None = None
+    blocks: VoxelsConfig | None = None
     agent: Agent | None = None
     state_A: np.ndarray | None = None
     floor_z: float = 0.0
 
 
-def open_place(start: Start, height: int, width: int, body: str = "") -> StartPoint:
+def open_place(
+    start: Start, height: int, width: int, blocks: VoxelsConfig | None = None, body: str = ""
+) -> StartPoint:
     """Open the scene in which a drive starts, for images of this size.
 
-    ``body`` is the name of the body that the agent has; "" for a camera that moves on the ground.
+    Houses and meshes are shown as ``blocks``, if they are given. ``body`` is the name of the body
+    that the agent has; "" for a camera that moves on the ground.
 
     Raises:
         UserError: the scene does not exist or cannot be used.
@@ -85,16 +93,19 @@ def open_place(start: Start, height: int, width: int, body: str = "") -> StartPo
     around[:-1, 2] += 2 * np.pi * np.arange(1, LOOKS) / LOOKS
     name = Path(start.scene).name if start.scene else f"house {start.house}"
     if not body:
-        return StartPoint(name, simulator.frames(around), planar, simulator)
+        poses = np.stack([simulator.world_from_camera(pose) for pose in around])
+        camera = Camera(np.tile(simulator.intrinsics_4, (LOOKS, 1)), poses)
+        seen = _rendered(simulator, blocks, camera, height, width)
+        return StartPoint(name, seen, planar, simulator, blocks)
     agent = open_agent(body, start.camera_height)
     place = StartPoint(
         name,
         simulator.frames(around[-1:]),
         planar,
         simulator,
-        agent,
-        agent.body.rest,
-        float(simulator.grid.floor_z),
+        agent=agent,
+        state_A=agent.body.rest,
+        floor_z=float(simulator.grid.floor_z),
     )
     camera = agent.camera(
         planar[None], agent.body.rest[None], simulator.intrinsics_4[None], place.floor_z
@@ -121,6 +132,21 @@ def _embodied(start: Start, place: StartPoint, body: str) -> StartPoint:
     return dataclasses.replace(place, planar_3=planar, agent=agent, state_A=state, floor_z=floor_z)
 
 
+def blocks_of(model: World) -> VoxelsConfig | None:
+    """Return the cells as which a world's places are shown; None if it was trained on surfaces."""
+    memory: Any = getattr(model, "memory", None)
+    if not getattr(memory, "CLASSES", False) or memory.pictures != "cells":
+        return None
+    return VoxelsConfig(
+        record=True,
+        cell=memory.cell_m[0],
+        side=memory.recorded,
+        kinds=memory.kinds,
+        colours=memory.colours,
+        pictures="cells",
+    )
+
+
 def require_shown(model: World, start: Start) -> None:
     """Refuse to start a drive with other images than the world was trained on.
 
@@ -134,11 +160,10 @@ def require_shown(model: World, start: Start) -> None:
         return
     if start.episode:
         require_same_cells(model, EpisodeSource(Path(start.episode))[start.number])
-    elif memory.pictures == "cells":
+    elif start.recording and memory.pictures == "cells":
         raise UserError(
-            "This world was trained on images of blocks, but generated houses, meshes and "
-            "recordings "
-            "show surfaces: start with an episode of its data, such as --episode "
+            "This world was trained on images of blocks, but recordings show surfaces: start in a "
+            "generated house or a mesh, or with an episode of its data, such as --episode "
             "data/persist/revisit."
         )
 
@@ -158,11 +183,31 @@ def truth(
     if place.simulator is None:
         return None
     host = Camera(np.asarray(camera.intrinsics_4), np.asarray(camera.world_from_camera))
+    if posture is None or place.agent is None:
+        return _rendered(place.simulator, place.blocks, host, height, width)
     seen = render(place.simulator.scene, host, height, width)
-    if posture is not None and place.agent is not None:
-        planar, state = (np.repeat(x[None], len(host.world_from_camera), 0) for x in posture)
-        place.agent.render_over(seen, planar, state, host, place.floor_z, 0)
-    return Frames(seen.rgb_THWC, seen.depth_THW, host)
+    planar, state = (np.repeat(x[None], len(host.world_from_camera), 0) for x in posture)
+    place.agent.render_over(seen, planar, state, host, place.floor_z, 0)
+    return Frames(seen.rgb_THWC, _measured(seen.depth_THW), host)
+
+
+def _rendered(
+    simulator: Simulator, blocks: VoxelsConfig | None, camera: Camera, height: int, width: int
+) -> Frames:
+    """Return what (T,) cameras see of a house or mesh, as blocks or as surfaces."""
+    scene = simulator.scene
+    if blocks is None:
+        seen = render(scene, camera, height, width)
+        return Frames(seen.rgb_THWC, _measured(seen.depth_THW), camera)
+    eye = np.asarray(camera.world_from_camera)[:, :3, 3]
+    voxels = record_voxels(blocks, scene, float(simulator.grid.floor_z), eye)
+    seen = draw_blocks(voxels, camera, height, width)
+    return Frames(seen.rgb_THWC, seen.depth_THW, camera)
+
+
+def _measured(depth: np.ndarray) -> np.ndarray:
+    """Return depth with 0 where an episode's depth cannot be recorded."""
+    return np.where(depth <= DEPTH_LIMIT_M, depth, np.float32(0))
 
 
 def walk(

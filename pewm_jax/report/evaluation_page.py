@@ -21,6 +21,7 @@ from pewm_jax.report.labels import (
     labelled,
     own_method,
     summary_lines,
+    voxel_table,
 )
 from pewm_jax.report.page import (
     Bullets,
@@ -116,7 +117,7 @@ def evaluation_page(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         above = Section("The map, from above", [figure])
     measured = (
         *(scores, houses, steering, steering_scores, structure, videos),
-        *(_frame_by_frame, drift, growth, mirror, coverage),
+        *(_frame_by_frame, drift, growth, mirror, coverage, voxels),
     )
     sections = [_rollouts(gallery), *(part(metrics) for part in measured), above]
     sections.append(_protocol(metrics["protocol"]))
@@ -478,6 +479,20 @@ def coverage(metrics: Mapping[str, Any]) -> Section | None:
     rows = [row(label, f"{100 * shares[key]:.1f} %") for key, label in COVERAGE_NAMES.items()]
     text = "Share of the pixels seen before whose surface is"
     return Section.of_table("What the map covers", ["", "share"], rows, text=text)
+
+
+def voxels(metrics: Mapping[str, Any]) -> Section | None:
+    """Return the scores of a voxel world; None for other worlds."""
+    found = metrics.get("voxels")
+    if not found:
+        return None
+    note = (
+        "Unseen walls: the intersection over union with the recorded walls, over the cells of the "
+        "window that no observed frame shows. Lost: PSNR of the observed frames, imagined before "
+        "the walk and after it. Doorways: those that the observed frames show open, and those of "
+        "them that the world's grid still lets one pass after the walk."
+    )
+    return Section("The voxels", [TableBlock(voxel_table(found)), Text(note, "quiet")])
 
 
 def _protocol(protocol: Mapping[str, Any]) -> Section:

@@ -256,6 +256,67 @@ def format_steering(metrics: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+VOXEL_ROWS = {
+    "as trained": "as trained",
+    "persistence_logit": "persistence_logit 0: known cells do not persist",
+    "empty_prior": "empty_prior 0",
+    "observation_logit": "observation_logit 0: images are no evidence",
+    "guesses": "guesses are not revised",
+}
+"""Labels of a voxel world's rows; other worlds have their names."""
+
+
+def voxel_table(found: Mapping[str, Any]) -> Table:
+    """Return the scores of a voxel world, and of it with mechanisms switched off, as a table."""
+    long = found["long"]
+    heads = ["", "unseen walls, IoU ↑"]
+    if long:
+        spans = zip((0, *long["ends"][:-1]), long["ends"], strict=True)
+        heads += [f"PSNR, dB, {low + 1}–{high} ↑" for low, high in spans]
+        heads += ["lost, dB ↓", "doorways open", f"FVD, {long['frames']} frames ↓"]
+    rows = []
+    for name, scores in found["rows"].items():
+        cells = [f"{scores['iou']:.3f}" if "iou" in scores else "–"]
+        if long:
+            cells += [f"{value:.2f}" for value in scores["psnr"]]
+            cells.append(f"{scores['lost']:+.2f}" if "lost" in scores else "–")
+            doorways = scores.get("doorways")
+            cells.append(f"{doorways[1]} of {doorways[0]}" if doorways else "–")
+            cells.append(f"{scores['fvd']:.0f}" if "fvd" in scores else "–")
+        rows.append([VOXEL_ROWS.get(name, name), *cells])
+    return Table.of(heads, rows)
+
+
+def format_voxels(metrics: Mapping[str, Any]) -> list[str]:
+    """Return sentences on the voxels of a world, if it has any."""
+    found = metrics.get("voxels")
+    if not found:
+        return []
+    unseen, known, long = found["unseen"], found["known"], found["long"]
+    ratio = f" ({unseen['iou'] / unseen['prior']:.2f} times)" if unseen["prior"] else ""
+    walls = (
+        f"IoU of walls that no observed frame shows: {unseen['iou']:.3f}; of the mean layout of "
+        f"other houses {unseen['prior']:.3f}{ratio}, at {unseen['places']:.0f} places in "
+        f"{unseen['houses']:.0f} houses."
+    )
+    said = [walls, f"PSNR of rendering a known grid: {known['psnr']:.2f} dB."]
+    own = found["rows"]["as trained"]
+    if not long:
+        return [*said, "Long walks are not measured: give a data set with them by --long."]
+    before, after = own["seen"]
+    count, passed = own["doorways"]
+    said.append(
+        f"After {long['frames']} frames, {own['lost']:+.2f} dB are lost over pixels seen before "
+        f"({before:.2f} dB at first, {after:.2f} dB then); of {count} doorways seen open {passed} "
+        "are passable."
+    )
+    names = [name for name in ("as trained", *long["beside"]) if "fvd" in found["rows"][name]]
+    if names:
+        values = (f"{VOXEL_ROWS.get(n, n)} {found['rows'][n]['fvd']:.0f}" for n in names)
+        said.append(f"FVD over {long['frames']} frames, lower is better: {'; '.join(values)}.")
+    return said
+
+
 def format_map_growth(metrics: Mapping[str, Any]) -> list[str]:
     """Return a sentence on how the map grows, if there is one."""
     found = metrics["long"]["growth"]
@@ -286,7 +347,8 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
     lines += [format_lpips(metrics), format_fvd(metrics)]
     lines += [format_coverage(metrics["coverage"])] if metrics["coverage"] else []
     lines += [format_drift(metrics["long"]["drift"][own]), *format_map_growth(metrics)]
-    return [*lines, *format_steering(metrics), *format_scs(metrics), format_mirror(metrics)]
+    lines += [*format_steering(metrics), *format_scs(metrics), format_mirror(metrics)]
+    return [*lines, *format_voxels(metrics)]
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:
@@ -296,4 +358,6 @@ def score_lines(metrics: Mapping[str, Any]) -> list[str]:
         [label, *(with_error(results[method][mask]["psnr"], 2) for mask in MASK_NAMES)]
         for method, label in labelled(results)
     ]
-    return Table.of(["PSNR, dB", *MASK_NAMES.values()], rows).text()
+    lines = Table.of(["PSNR, dB", *MASK_NAMES.values()], rows).text()
+    voxels = metrics.get("voxels")
+    return [*lines, *(voxel_table(voxels).text() if voxels else [])]

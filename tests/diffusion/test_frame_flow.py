@@ -113,3 +113,15 @@ def test_times_at_the_ends_are_those_that_one_step_meets():
     for change in ({"sample_steps": 2}, {"per_frame": False}):
         with pytest.raises(ConfigError, match=r"noise\.times is ends"):
             dataclasses.replace(config, **change)
+
+
+def test_a_share_of_frames_has_the_time_of_given_frames():
+    noise = FrameFlowConfig(per_frame=True, history=0.25, context_noise=0.02, shifted_times=True)
+    times = np.asarray(noise.draw(jax.random.key(0), 400, 5))
+    share = (times == np.float32(0.02)).mean()
+    assert 0.2 < share < 0.3
+    plain = dataclasses.replace(noise, history=0.0).draw(jax.random.key(0), 400, 5)
+    other = times != np.float32(0.02)
+    np.testing.assert_array_equal(times[other], np.asarray(plain)[other])
+    with pytest.raises(ConfigError, match=r"noise\.history is 1"):
+        FrameFlowConfig(per_frame=True, history=1.0)

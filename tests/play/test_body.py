@@ -74,7 +74,7 @@ def a_puppet():
 
 @functools.cache
 def a_place():
-    return places.open_place(Start(house=2), SIZE, SIZE, "humanoid")
+    return places.open_place(Start(house=2), SIZE, SIZE, body="humanoid")
 
 
 def begun():
@@ -207,7 +207,7 @@ def data(tmp_path_factory):
 
 def test_a_drive_begins_in_an_episode_of_the_body_and_no_other(data):
     start = Start(episode=str(data / "body/train"), frames=8)
-    place = places.open_place(start, SIZE, SIZE, "humanoid")
+    place = places.open_place(start, SIZE, SIZE, body="humanoid")
     episode = EpisodeSource(data / "body/train")[0]
     np.testing.assert_allclose(place.state_A, episode.states[7])
     pose = place.agent.camera(
@@ -216,10 +216,10 @@ def test_a_drive_begins_in_an_episode_of_the_body_and_no_other(data):
     np.testing.assert_allclose(pose, episode.world_from_camera[7], atol=1e-4)
     other = dataclasses.replace(start, episode=str(data / "camera/train"))
     with pytest.raises(UserError, match="not recorded by the body humanoid"):
-        places.open_place(other, SIZE, SIZE, "humanoid")
+        places.open_place(other, SIZE, SIZE, body="humanoid")
     recording = Start(recording=str(data), intrinsics=(1.0, 1.0, 1.0, 1.0))
     with pytest.raises(UserError, match="a recording does not show"):
-        places.open_place(recording, SIZE, SIZE, "humanoid")
+        places.open_place(recording, SIZE, SIZE, body="humanoid")
     camera = session.begin(a_puppet(), places.open_place(other, SIZE, SIZE))
     with pytest.raises(UserError, match="no joints"):
         session.apply(a_puppet(), camera, session.Pose((0.0,)))

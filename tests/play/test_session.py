@@ -236,14 +236,27 @@ def write_recording(folder, frames):
     (folder / "poses.log").write_text("\n".join(lines))
 
 
-def test_a_world_of_blocks_does_not_begin_with_surfaces():
-    places.require_shown(MODEL, Start())
+def test_a_world_of_blocks_begins_in_houses_of_blocks_and_not_with_surfaces():
+    recorded = Start(recording="room", intrinsics=(8.0, 8.0, 8.0, 8.0))
+    places.require_shown(MODEL, recorded)
     with pytest.raises(UserError, match="was trained on images of blocks"):
-        places.require_shown(PERSIST, Start())
+        places.require_shown(PERSIST, recorded)
     surfaces = dataclasses.replace(PERSIST.memory, pictures="surfaces")
-    places.require_shown(
-        dataclasses.replace(PERSIST, memory=surfaces, observation_logit=0.0), Start()
-    )
+    plain = dataclasses.replace(PERSIST, memory=surfaces, observation_logit=0.0)
+    places.require_shown(plain, recorded)
+    assert places.blocks_of(plain) is None
+    assert places.blocks_of(MODEL) is None
+    blocks = places.blocks_of(PERSIST)
+    assert blocks is not None
+    place = places.open_place(Start(house=2), 16, 16, blocks)
+    places.require_shown(PERSIST, Start())
+    one = jax.tree.map(lambda x: x[-1:], place.frames.camera)
+    seen = places.truth(place, one, 16, 16)
+    assert seen is not None
+    np.testing.assert_array_equal(seen.rgb_THWC[0], place.frames.rgb_THWC[-1])
+    other = places.open_place(Start(house=2), 16, 16)
+    np.testing.assert_array_equal(other.planar_3, place.planar_3)
+    assert np.any(other.frames.rgb_THWC != place.frames.rgb_THWC)
 
 
 def test_a_drive_begins_with_a_recording_of_another_shape(tmp_path):

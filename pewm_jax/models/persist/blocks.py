@@ -92,10 +92,13 @@ def shapes(config: BlocksConfig, parts: Parts) -> Iterator[Leaf]:
     """Yield path and shape of every parameter of one block."""
     width, hidden = config.width, config.mlp_ratio * config.width
     sizes = {f"to_{name}": (width, width) for name in ("q", "k", "v", "out")}
-    sizes |= {"up": (width, hidden), "down": (hidden, width), "modulate": (width, 6 * width)}
+    sizes |= {"up": (width, hidden), "down": (hidden, width)}
     for part in parts:
         for name, (inward, outward) in sizes.items():
             yield from parameters.linear(f"{part}/{name}", inward, outward)
+        if config.modulation == "own":
+            yield f"{part}/modulate/kernel", (width, 6 * width)
+        yield f"{part}/modulate/bias", (6 * width,)
         yield f"{part}/norm_q/scale", (config.head_dim,)
         yield f"{part}/norm_k/scale", (config.head_dim,)
 
@@ -123,14 +126,19 @@ def init(config: BlocksConfig, parts: Parts, ends: Iterable[Leaf], key: Array) -
     one = dict(shapes(config, parts))
     blocks = jax.vmap(lambda k: draw(one, k))(jax.random.split(blocks_key, config.layers))
     open_ = jnp.arange(6 * config.width) // config.width % 3 == 2
+    shared = {}
     for part in parts:
         modulate = blocks[part]["modulate"]
-        modulate["kernel"] = jnp.zeros_like(modulate["kernel"])
+        kernel = jnp.zeros((config.width, 6 * config.width))
+        if config.modulation == "own":
+            modulate["kernel"] = jnp.zeros_like(modulate["kernel"])
+        else:
+            shared[part] = {"kernel": kernel}
         if config.gates == "open":
             modulate["bias"] = modulate["bias"] + open_
     for name in ("modulate_out", "proj_out"):
         params[name]["kernel"] = jnp.zeros_like(params[name]["kernel"])
-    return {**params, "blocks": blocks}
+    return {**params, "blocks": blocks} | ({"modulate": shared} if shared else {})
 
 
 def mlp(part: Params, x: Array) -> Array:
@@ -157,6 +165,7 @@ def run(
     """Run all blocks on T frames; also return the cache that includes them, if there is one.
 
     Args:
+        params: those of the network, with ``blocks``, and ``modulate`` if the blocks share it.
         x_BTND: tokens of the frames after the cache's; their dtype is that of the computation.
         condition_BTD: each frame's condition, from which its modulation is made.
         context_BTMD: the tokens that ``cross`` attends to, each frame to its own.
@@ -175,12 +184,18 @@ def run(
         known_BN1S = jnp.moveaxis(known_BTN, 1, 2)[:, :, None]
         allowed = (allowed & (known_BN1S | itself))[:, :, None]  # (B, N, 1, T, S)
     condition = jax.nn.silu(condition_BTD)[:, :, None]
+    common = {part: linear(layer, condition) for part, layer in params.get("modulate", {}).items()}
+
+    def modulation(part: str, layer: Params) -> Array:
+        if part not in common:
+            return linear(layer, condition)
+        return common[part] + layer["bias"].astype(condition.dtype)
 
     def body(x: Array, layer: Any) -> tuple[Array, Any]:
         weights, kept = layer
         for part in parts:
             inside = weights[part]
-            shift, scale, gate, *after = jnp.split(linear(inside["modulate"], condition), 6, -1)
+            shift, scale, gate, *after = jnp.split(modulation(part, inside["modulate"]), 6, -1)
             normed = norm(x) * (1 + scale) + shift
             if part == "time":
                 mixed, kept = _over_time(config, inside, normed, angles_TR, allowed, kept)
@@ -197,7 +212,7 @@ def run(
 
     body = jax.checkpoint(body) if config.remat else body
     before = None if cache is None else (cache.keys_LBSNKd, cache.values_LBSNKd)
-    x, after = jax.lax.scan(body, x_BTND, (params, before))
+    x, after = jax.lax.scan(body, x_BTND, (params["blocks"], before))
     if cache is None:
         return x, None
     keys, values = after

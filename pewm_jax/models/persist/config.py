@@ -29,6 +29,10 @@ class BlocksConfig:
     gates: Literal["zero", "open"] = "zero"
     """Initial values of the modulation's gates. `zero`: every block is the identity, as
     published. `open`: 1, with which small networks learn faster."""
+    modulation: Literal["own", "shared"] = "own"
+    """`own`: every block computes its modulation from the condition, as published. `shared`: the
+    blocks share that linear layer and add a learned vector each (adaLN-single, arXiv 2310.00426),
+    which takes less than a third of the parameters of a block."""
     attention: Literal["auto", "xla", "cudnn", "splash"] = "auto"
     """The kernel of attention inside of a frame and to pixels: `cudnn` is flash attention on NVIDIA
     GPUs in 16 bits, `splash` is flash attention on TPUs, `xla` runs anywhere, `auto` uses the best
@@ -184,13 +188,29 @@ class VoxelDiTConfig:
     """Channels of the picture's latents, to which frames attend."""
     pixel_patch: int = 2
     """Latents of the picture along each axis for one token."""
+    map_embed: int = 0
+    """Channels of the learned vectors of the cells that the map holds, and of the mask beside them
+    (unknown, guessed, observed), in its input; 0 for none, as published."""
+    map_ids: int = 0
+    """Ids of such cells, where `map_embed` is not 0: the classes, a colour each for surfaces whose
+    kind is not known yet, and one for surfaces of unknown colour."""
+    map_cells: int = 1
+    """Cells along an axis of the grid for one latent, where `map_embed` is not 0."""
+    storey: tuple[int, int] = (0, 0)
+    """The first token along z that it predicts, and the one after the last; (0, 0) for all, as
+    published. Cells above and below are empty unless they are known."""
     blocks: BlocksConfig = BlocksConfig()
     """The transformer blocks."""
 
     def __post_init__(self):
         """Validate."""
         names = ("latent_side", "latent_channels", "patch", "actions", "pixel_channels")
-        require_positive(self, "voxel_dit", *names, "pixel_patch")
+        require_positive(self, "voxel_dit", *names, "pixel_patch", "map_cells")
+        require(
+            self.map_embed >= 0 and (self.map_ids >= 2 or not self.map_embed),
+            f"voxel_dit.map_embed is {self.map_embed} and voxel_dit.map_ids {self.map_ids}: use 0 "
+            "channels for no map, or 1 or more and at least 2 ids.",
+        )
         require(
             self.camera_numbers >= 0,
             f"voxel_dit.camera_numbers is {self.camera_numbers}: use 0 for none, or 10.",
@@ -200,11 +220,31 @@ class VoxelDiTConfig:
             f"voxel_dit.latent_side is {self.latent_side}: use a multiple of voxel_dit.patch "
             f"({self.patch}).",
         )
+        low, high = self.storey
+        most = self.latent_side // self.patch
+        require(
+            (low, high) == (0, 0) or 0 <= low < high <= most,
+            f"voxel_dit.storey is {self.storey}: name the first token along z and the one after "
+            f"the last, from 0 to {most}, or 0 0 for all.",
+        )
+
+    @property
+    def token_sides(self) -> tuple[int, int, int]:
+        """Tokens of a frame along x, y and z."""
+        side = self.latent_side // self.patch
+        low, high = self.levels
+        return side, side, high - low
+
+    @property
+    def levels(self) -> tuple[int, int]:
+        """The first token along z that is predicted, and the one after the last."""
+        return (0, self.latent_side // self.patch) if self.storey == (0, 0) else self.storey
 
     @property
     def tokens(self) -> int:
         """Tokens of a frame."""
-        return (self.latent_side // self.patch) ** 3
+        x, y, z = self.token_sides
+        return x * y * z
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,6 +313,12 @@ class VoxelRendererConfig:
     """Latents along each axis for one token."""
     actions: int = 0
     """Numbers of an action, whose effect voxels and camera contain already; 0 for none."""
+    corrupted: float = 0.0
+    """Share of the clips in training whose voxels are corrupted: parts are missing, moved or there
+    twice. The image to render stays the true one."""
+    imagined: float = 0.0
+    """Share of the clips in training whose voxels the world frames' transformer has imagined from
+    the clip's first image."""
     blocks: BlocksConfig = BlocksConfig(context=16)
     """The transformer blocks."""
 
@@ -301,6 +347,11 @@ class VoxelRendererConfig:
         )
         require(self.actions >= 0, f"renderer.actions is {self.actions}: use 0 for none, or more.")
         require(self.drawn >= 0, f"renderer.drawn is {self.drawn}: use 0 for none, or more.")
+        require(
+            min(self.corrupted, self.imagined) >= 0 and self.corrupted + self.imagined <= 1,
+            f"renderer.corrupted is {self.corrupted} and renderer.imagined {self.imagined}: use "
+            "shares of the clips, 0 or more and together at most 1.",
+        )
 
     @property
     def places(self) -> int:

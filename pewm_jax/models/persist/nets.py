@@ -96,6 +96,13 @@ class PersistNetsConfig(Backbone):
                 f"backbone.{name} is {found}, and the other parts of the model ask for {wanted}: "
                 "use that.",
             )
+        known = frames.map_ids, frames.map_cells
+        wanted = vae.classes + model.memory.colours + 1, vae.factor
+        require(
+            not frames.map_embed or known == wanted,
+            f"backbone.world_frames.map_ids and map_cells are {known}, and the other parts of the "
+            f"model ask for {wanted} (classes, colours and one; cells of a latent): use those.",
+        )
         require(
             view.actions in (0, model.control.actions),
             f"backbone.renderer.actions is {view.actions}: use 0, or control.actions "

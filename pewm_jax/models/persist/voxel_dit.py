@@ -8,8 +8,12 @@ modulate the frame's tokens (arXiv 2603.03482).
 The grid is aligned with the world's axes and moves with the agent, so a grid position is not a
 world position: the network has to shift its memory.
 
+With ``map_embed`` the cells that the map holds are a further input, with a mask beside them:
+unknown, guessed or observed. This is not published; the network then completes what was observed,
+and may revise guesses.
+
 Parameters: ``patch_embed, pixel_embed, no_pixels, time_embed, action, camera, blocks (stacked over
-layers), modulate_out, proj_out``.
+layers), modulate_out, proj_out``; ``map_ids``, ``map_mask`` and ``map_fold`` with ``map_embed``.
 """
 
 from __future__ import annotations
@@ -32,6 +36,9 @@ from pewm_jax.types import Array, Params
 PARTS = ("space", "time", "cross")
 SHARDING = frame_blocks.rules("voxel_dit")
 """Rules over the paths of its parameters under ``voxel_dit``."""
+ABSENT, GUESS, SEEN = 0, 1, 2
+"""States of a cell in the mask beside the map: unknown, guessed, observed."""
+STATES = 3
 
 
 def ends(config: VoxelDiTConfig) -> Iterator[Leaf]:
@@ -44,11 +51,20 @@ def ends(config: VoxelDiTConfig) -> Iterator[Leaf]:
     yield from frame_blocks.end_shapes(width, cells)
     if config.camera_numbers:
         yield from frame_blocks.mlp_shapes("camera", config.camera_numbers, width)
+    if config.map_embed:
+        folded = (config.patch * config.map_cells) ** 3 * config.map_embed
+        yield "map_ids/kernel", (config.map_ids, config.map_embed)
+        yield "map_mask/kernel", (STATES, config.map_embed)
+        yield from linear_leaves("map_fold", folded, width)
 
 
 def init(config: VoxelDiTConfig, key: Array) -> Params:
     """Return random parameters, float32; the prediction is 0 at initialization."""
-    return frame_blocks.init(config.blocks, PARTS, ends(config), key)
+    params = frame_blocks.init(config.blocks, PARTS, ends(config), key)
+    for name, rows in (("map_ids", config.map_ids), ("map_mask", STATES)):
+        if name in params:  # only one row is looked up
+            params[name]["kernel"] *= rows**0.5
+    return params
 
 
 def empty_cache(config: VoxelDiTConfig, batch: int, dtype: Any = jnp.float32) -> FrameCache:
@@ -67,6 +83,7 @@ def apply(
     camera_BTN: Array | None = None,
     shown_BT: Array | None = None,
     known_BTxyz: Array | None = None,
+    map_BTXYZ: tuple[Array, Array] | None = None,
     cache: FrameCache | None = None,
 ) -> tuple[Array, FrameCache | None]:
     """Predict the target of the noise from noisy frames, with the cache that has these frames.
@@ -83,17 +100,24 @@ def apply(
         shown_BT: bool, whether a frame has its image; None means all have.
         known_BTxyz: bool, which latents are known; tokens of others are not read by later frames.
             None means all are.
+        map_BTXYZ: ids (B, T, X, Y, Z) of the cells that the map holds, below 0 if unknown, and the
+            mask beside them: ``ABSENT``, ``GUESS`` or ``SEEN``; with ``config.map_embed``.
+
+    Returns:
+        The prediction, 0 outside of ``config.storey``, and the cache.
 
     Raises:
-        UserError: an argument of another shape, or cameras where the network takes none.
+        UserError: an argument of another shape, or cameras or a map where the network takes none.
     """
     _require(config, latents_BTxyzC, actions_BTA, pixels_BThwC, camera_BTN)
+    _require_map(config, latents_BTxyzC, map_BTXYZ)
     (batch, frames), dtype = latents_BTxyzC.shape[:2], latents_BTxyzC.dtype
-    width, side = config.blocks.width, config.latent_side // config.patch
-    cube = latents_BTxyzC.reshape(batch * frames, *latents_BTxyzC.shape[2:])
-    patches = patchify(cube, config.patch, config.patch).reshape(batch, frames, config.tokens, -1)
-    x = linear(params["patch_embed"], patches)
-    x = x + jnp.asarray(frame_blocks.positions((side,) * 3, width), dtype)
+    width = config.blocks.width
+    patches = patchify(_storey(config, latents_BTxyzC), config.patch, config.patch)
+    x = linear(params["patch_embed"], patches.reshape(batch, frames, config.tokens, -1))
+    x = x + jnp.asarray(frame_blocks.positions(config.token_sides, width), dtype)
+    if map_BTXYZ is not None:
+        x = x + _embed_map(config, params, *map_BTXYZ, dtype)
 
     given = linear(params["pixel_embed"], patchify(pixels_BThwC.astype(dtype), config.pixel_patch))
     rows, columns = (n // config.pixel_patch for n in pixels_BThwC.shape[2:4])
@@ -111,12 +135,12 @@ def apply(
             seen = jnp.where(jnp.asarray(shown_BT)[..., None], seen, 0)
         condition = condition + seen
     if known_BTxyz is not None:
-        cube = known_BTxyz.reshape(batch * frames, *known_BTxyz.shape[2:], 1)
-        known_BTxyz = patchify(cube, config.patch, config.patch).all(-1).reshape(x.shape[:3])
+        patches = patchify(_storey(config, known_BTxyz[..., None]), config.patch, config.patch)
+        known_BTxyz = patches.all(-1).reshape(x.shape[:3])
     x, cache = frame_blocks.run(
         config.blocks,
         PARTS,
-        params["blocks"],
+        params,
         x,
         condition,
         context_BTMD=given,
@@ -124,9 +148,47 @@ def apply(
         cache=cache,
     )
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
-    side = config.latent_side
-    out = unpatchify(out, side, side, side, config.patch, config.patch)
-    return out.reshape(latents_BTxyzC.shape), cache
+    x_side, y_side, z_side = (count * config.patch for count in config.token_sides)
+    out = unpatchify(out, x_side, y_side, z_side, config.patch, config.patch)
+    low, high = (at * config.patch for at in config.levels)
+    out = out.reshape(batch, frames, *out.shape[1:])
+    beside = [(0, 0)] * 4 + [(low, config.latent_side - high), (0, 0)]
+    return jnp.pad(out, beside), cache
+
+
+def _storey(config: VoxelDiTConfig, grid_BTxyzC: Array, cells: int = 1) -> Array:
+    """Return the predicted levels of grids of ``cells`` cells per latent, (B · T, x, y, z, C)."""
+    low, high = (at * config.patch * cells for at in config.levels)
+    cut = grid_BTxyzC[..., low:high, :]
+    return cut.reshape(-1, *cut.shape[2:])
+
+
+def _embed_map(
+    config: VoxelDiTConfig, params: Params, ids_BTXYZ: Array, mask_BTXYZ: Array, dtype: Any
+) -> Array:
+    """Return tokens (B, T, N, D) of the cells that the map holds and of the mask beside them."""
+    both = jnp.stack([ids_BTXYZ.astype(jnp.int32), mask_BTXYZ.astype(jnp.int32)], -1)
+    cells = config.map_cells
+    ids, mask = jnp.moveaxis(_storey(config, both, cells), -1, 0)
+    table = params["map_ids"]["kernel"].astype(dtype)
+    seen = jnp.where((ids >= 0)[..., None], table[jnp.maximum(ids, 0)], 0)
+    seen = seen + params["map_mask"]["kernel"].astype(dtype)[mask]
+    side = config.patch * cells
+    folded = patchify(seen, side, side)
+    return linear(params["map_fold"], folded.reshape(*ids_BTXYZ.shape[:2], config.tokens, -1))
+
+
+def _require_map(
+    config: VoxelDiTConfig, latents: Array, map_BTXYZ: tuple[Array, Array] | None
+) -> None:
+    """Refuse a map of another shape, one that the network does not take, or none if it does."""
+    wanted = (*latents.shape[:2], *(config.latent_side * config.map_cells,) * 3)
+    shapes = [x.shape for x in map_BTXYZ or ()]
+    if shapes != ([wanted, wanted] if config.map_embed else []):
+        raise UserError(
+            f"The map's cells and mask have shapes {shapes}: this network takes two of {wanted}, "
+            "and none where voxel_dit.map_embed is 0."
+        )
 
 
 def _require(

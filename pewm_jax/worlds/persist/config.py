@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pewm_jax.config import (
     ArraySpec,
@@ -56,6 +56,15 @@ class PersistTrainConfig(TrainSettings):
 
     occupied: float = 1.0
     """Weight of the error of latents with occupied cells; 1 as published. Most cells are air."""
+    new: float = 1.0
+    """Weight of the error of latents with cells that the map does not hold yet, where
+    `world_frames.map_embed` is not 0: those are what the network has to complete."""
+    guessed: float = 0.5
+    """Share of the clips whose map also holds guesses of the cells that were not observed: the true
+    cells, parts of which are missing, moved or there twice. In the others these are unknown."""
+    entering: float = 0.7
+    """Share of the clips with guesses in which the cells at one side of the window are unknown, as
+    where the agent walks on."""
     classes: float = 0.0
     """Weight of the cross-entropy of a world frame's classes, through the frozen decoder, relative
     to the error of its latents; 0 as published. It needs a decoder that decodes one latent at a
@@ -69,6 +78,10 @@ class PersistTrainConfig(TrainSettings):
         require(self.occupied > 0, f"train.occupied is {self.occupied}: use a number above 0.")
         require(self.classes >= 0, f"train.classes is {self.classes}: use 0 or more.")
         require(self.compared >= 1, f"train.compared is {self.compared}: use 1 or more.")
+        require(self.new > 0, f"train.new is {self.new}: use a number above 0.")
+        for name in ("guessed", "entering"):
+            value = getattr(self, name)
+            require(0 <= value <= 1, f"train.{name} is {value}: use a share, 0 to 1.")
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
 
     def require_fit(self, model: Any) -> None:
@@ -120,12 +133,21 @@ class PersistModel(AssembledModel):
     persistence_logit: float = 0.0
     """Nats by which another class must be likelier than a cell's previous class to replace it; 0 as
     published. Small networks forget without it."""
+    shown_logit: float = -1.0
+    """The same for a cell that was never observed, but shown by an imagined frame; -1 for that of
+    `persistence_logit`."""
+    guess_logit: float = -1.0
+    """The same for a guess that was neither observed nor shown, so that it can be revised; -1 for
+    that of `shown_logit`."""
     empty_prior: float = 0.0
     """Nats by which a class must be likelier than air in an unknown cell; 0 as published. Small
     networks fill unknown cells with clutter without it."""
     observation_logit: float = 0.0
     """Nats that a real image of blocks (`memory.pictures cells`) adds to the class that it shows in
     a cell: air before the measured depth, a surface at it; 0 as published."""
+    sampled: Literal["always", "new"] = "always"
+    """Imagined frames of which the voxels are sampled: `always`, as published, or those with `new`
+    cells in the window; in the others nothing has changed that a guess could be revised by."""
     points: bool = False
     """Whether the image that conditions a voxel frame has the positions of its surfaces, from
     depth, as further channels; not as published."""
@@ -146,7 +168,7 @@ class PersistModel(AssembledModel):
     @property
     def capabilities(self) -> Capabilities:
         """The capabilities of a world of voxels, all of whose stages train with voxels."""
-        return dataclasses.replace(super().capabilities, stage_without_memory=False)
+        return dataclasses.replace(super().capabilities, stage_without_memory=False, voxels=True)
 
     @property
     def side(self) -> int:
@@ -162,6 +184,13 @@ class PersistModel(AssembledModel):
     def picture_channels(self) -> int:
         """Channels of an image's latents, including those of depth if depth is imagined."""
         return self.codec.channels if self.clip.depth else self.codec.rgb_channels
+
+    @property
+    def kept_logits(self) -> tuple[float, float, float]:
+        """Nats in favour of the previous class of a guessed, of a shown and of an observed cell."""
+        shown = self.persistence_logit if self.shown_logit < 0 else self.shown_logit
+        guess = shown if self.guess_logit < 0 else self.guess_logit
+        return guess, shown, self.persistence_logit
 
     @property
     def shown_channels(self) -> int:
@@ -186,6 +215,9 @@ class PersistModel(AssembledModel):
             )
         logits = ("persistence_logit", "empty_prior", "observation_logit")
         require_fields(self, "model", lambda value: value >= 0, "0 or more nats", *logits)
+        optional = ("shown_logit", "guess_logit")
+        hint = "0 or more nats, or -1"
+        require_fields(self, "model", lambda value: value >= 0 or value == -1, hint, *optional)
         for name in ("points", "observation_logit"):
             require(
                 self.clip.depth or not getattr(self, name),

@@ -11,17 +11,22 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import UserError
 from pewm_jax.geometry.actions import camera_numbers
+from pewm_jax.geometry.cameras import einsum
 from pewm_jax.geometry.march import RayHits
+from pewm_jax.memory.class_grid import UNKNOWN, ClassGrid
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
+from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Clip, Params
+from pewm_jax.worlds.persist import corruption, voxel_frames
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist.config import PersistModel
-from pewm_jax.worlds.persist.step import draw_latents
+from pewm_jax.worlds.persist.step import draw_latents, imagine_window, shown_cells
 
 
 def leading_actions(actions_BTA: Array) -> Array:
@@ -104,13 +109,16 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
     classes = cut_windows(model, clip, last, recorded)
     shape = classes.shape[:2]
     flat = classes.reshape(-1, *classes.shape[2:])
-    config, weights = model.backbone.voxel_vae, params["voxel_vae"]
-    dtype = jnp.dtype(model.dtype)
+    config, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)
 
-    def encode(grid: Array) -> Array:
-        return voxel_vae.encode(config, weights, jnp.maximum(grid, 0)[None].astype(int), dtype)[0]
+    def encode(weights: Params, flat: Array) -> Array:
+        def one(grid: Array) -> Array:
+            ids = jnp.maximum(grid, 0)[None].astype(int)
+            return voxel_vae.encode(config, weights, ids, dtype)[0]
 
-    latents = jax.lax.map(encode, flat)
+        return jax.lax.map(one, flat)
+
+    latents = placement.by_batch(encode, params["voxel_vae"], flat)
     latents = latents.reshape(*shape, *latents.shape[1:])
     recorded_too = jax.vmap(jax.vmap(functools.partial(grid_state.known_latents, model)))(classes)
     token, wide = model.backbone.token_cells, model.side
@@ -135,16 +143,71 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
         "occupied": occupied(model, classes),
         "classes": classes,
     }
+    if model.backbone.world_frames.map_embed:
+        made |= visible(model, clip, classes, corner[:, 0] + last[:, 0] * model.cell)
     return _prepared(clip, made)
+
+
+VIEWS = 6
+"""Further views from the first frame's camera, turned by equal angles, of the cells that may have
+been observed before a clip."""
+
+
+def visible(
+    model: PersistModel, clip: Clip, classes_BTXYZ: Array, corner_B3: Array
+) -> dict[str, Array]:
+    """Return which cells of a clip's window, whose lowest corner is given in metres, are visible.
+
+    ``seen`` is (B, X, Y, Z) uint8, the first frame of the clip that shows the cell, or T;
+    ``before`` is uint8 with one bit for each of the ``VIEWS`` that shows it.
+    """
+    frames = clip.frames
+    depth = as_signal(frames).depth_THW
+    camera = jax.tree.map(jnp.asarray, frames.camera)
+    count = depth.shape[1]
+
+    def one(inputs: tuple[Array, Array, Array, Camera]) -> tuple[Array, Array]:
+        classes, corner, depth, camera = inputs
+
+        def shows(frame: tuple[Array, Camera]) -> Array:
+            air, surface = voxel_frames.visible_cells(model, corner, *frame)
+            return air | surface
+
+        def turned(turn: Array) -> Array:
+            view = Camera(camera.intrinsics_4[0], turn_pose(camera.world_from_camera[0], turn))
+            return shown_cells(model, jnp.maximum(classes[0], 0), corner, view)
+
+        by_frame = jax.lax.map(shows, (depth, camera))
+        first = jnp.where(by_frame.any(0), by_frame.argmax(0), count)
+        around = jax.lax.map(turned, jnp.arange(VIEWS) * np.float32(2 * np.pi / VIEWS))
+        bits = around * (1 << jnp.arange(VIEWS))[:, None, None, None]
+        return first.astype(jnp.uint8), bits.sum(0).astype(jnp.uint8)
+
+    seen, before = jax.lax.map(one, (classes_BTXYZ, corner_B3, depth, camera))
+    return {"seen": seen, "before": before}
+
+
+def turn_pose(world_from_camera_44: Array, angle: Array) -> Array:
+    """Return a pose turned about the vertical axis of the world through its position, radians."""
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    turn = jnp.eye(3).at[:2, :2].set(jnp.stack([jnp.stack([cos, -sin]), jnp.stack([sin, cos])]))
+    return world_from_camera_44.at[:3, :3].set(
+        einsum("ij,jk->ik", turn, world_from_camera_44[:3, :3])
+    )
 
 
 def occupied(model: PersistModel, classes_BTXYZ: Array) -> Array:
     """Return (B, T, x, y, z) bool: whether a known cell of a latent is occupied."""
-    *front, wide, _, _ = classes_BTXYZ.shape
+    return any_in_latent(model, classes_BTXYZ > 0)
+
+
+def any_in_latent(model: PersistModel, cells_BTXYZ: Array) -> Array:
+    """Return (B, T, x, y, z) bool: the latents with such a cell."""
+    *front, wide, _, _ = cells_BTXYZ.shape
     factor = model.backbone.voxel_vae.factor
     count = wide // factor
-    cells = (classes_BTXYZ > 0).reshape(*front, count, factor, count, factor, count, factor)
-    return cells.any((-5, -3, -1))
+    cut = cells_BTXYZ.reshape(*front, count, factor, count, factor, count, factor)
+    return cut.any((-5, -3, -1))
 
 
 def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
@@ -169,19 +232,28 @@ def cameras(model: PersistModel, params: Params, clip: Clip) -> Clip:
 
 
 def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
-    """Return latents of the images, and the hits of their rays in the true voxels."""
+    """Return latents of the images, and the hits of their rays in the true voxels.
+
+    In shares of the clips (``renderer.corrupted``, ``renderer.imagined``) the rays are cast through
+    voxels with errors instead; the images stay the true ones.
+    """
     recorded, start = lattice(model, clip)
     classes = jnp.maximum(cut_windows(model, clip, start, recorded), 0)
     size = model.cell
+    if model.backbone.renderer.corrupted or model.backbone.renderer.imagined:
+        classes = with_errors(model, params, clip, classes, start, recorded)
     corner = jnp.asarray(clip.extras["origin_T3"]) + (start - recorded) * size
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     pixels = (model.clip.height, model.clip.width)
 
-    def look(one: tuple[Array, Array, Camera]) -> RayHits:
-        grid, low, seen = one
-        return voxel_renderer.cast_rays(model.backbone.renderer, grid, low, size, seen, pixels)
+    def look(_: Params, *clips: Any) -> RayHits:
+        def one(clip: tuple[Array, Array, Camera]) -> RayHits:
+            grid, low, seen = clip
+            return voxel_renderer.cast_rays(model.backbone.renderer, grid, low, size, seen, pixels)
 
-    layers = jax.lax.map(look, (classes, corner, camera))
+        return jax.lax.map(one, clips)
+
+    layers = placement.by_batch(look, {}, classes, corner, camera)
     made = {
         "latents": pictures(model, params, clip)[0].astype(jnp.float16),
         "ids": layers.ids_L.astype(jnp.int16),
@@ -191,11 +263,81 @@ def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
     }
     if model.backbone.renderer.drawn:
 
-        def draw(one: tuple[Array, Array, Camera]) -> Array:
-            return jax.lax.map(lambda frame: draw_latents(model, params, *frame), one)
+        def draw(weights: Params, *clips: Any) -> Array:
+            def one(clip: tuple[Array, Array, Camera]) -> Array:
+                return jax.lax.map(lambda frame: draw_latents(model, weights, *frame), clip)
 
-        made["drawn"] = jax.lax.map(draw, (classes, corner, camera)).astype(jnp.float16)
+            return jax.lax.map(one, clips)
+
+        weights = {"codec": params.get("codec", {})}
+        drawn = placement.by_batch(draw, weights, classes, corner, camera)
+        made["drawn"] = drawn.astype(jnp.float16)
     return _prepared(clip, made)
+
+
+def with_errors(
+    model: PersistModel,
+    params: Params,
+    clip: Clip,
+    classes_BTXYZ: Array,
+    start_BT3: Array,
+    recorded_BT3: Array,
+) -> Array:
+    """Return windows of which some clips' are corrupted, or imagined from the first image.
+
+    Which clips depends on their contents. All frames of a clip have the same errors. The imagined
+    voxels are those of the window of the clip's last frame.
+    """
+    config, size = model.backbone.renderer, model.cell
+    low = jnp.asarray(clip.extras["origin_T3"]) - recorded_BT3 * size
+    frames = as_signal(clip.frames)
+    first = jax.tree.map(lambda x: jnp.asarray(x)[:, 0], frames)
+    last = start_BT3[:, -1]
+    can_imagine = "voxel_dit" in params
+
+    def one(inputs: tuple[Any, ...]) -> Array:
+        windows, starts, begin, corner, frame, key = inputs
+        share_key, change_key = jax.random.split(key)
+        drawn = jax.random.uniform(share_key)
+
+        def shared(grid: Array, at: Array) -> Array:
+            """Return a grid at cell ``at`` of the lattice as the windows of all frames."""
+            cut = jax.vmap(lambda start: grid_state.cut_box(grid, start - at, model.side))(starts)
+            return jnp.maximum(cut, 0).astype(windows.dtype)
+
+        def corrupted() -> Array:
+            changes = corruption.draw_changes(windows[0], change_key)
+            change = functools.partial(corruption.apply_changes, changes=changes)
+            return jax.vmap(lambda grid, off: change(grid, off_3=off))(windows, starts - starts[0])
+
+        def imagined() -> Array:
+            grid = ClassGrid(jnp.full((model.side,) * 3, UNKNOWN, jnp.int16), corner + begin * size)
+            made = imagine_window(model, params, grid, frame, change_key)
+            return shared(made, begin)
+
+        kind = jnp.where(drawn < config.corrupted, 1, 0)
+        if not can_imagine:
+            return jax.lax.cond(kind == 1, corrupted, lambda: windows)
+        within = (drawn >= config.corrupted) & (drawn < config.corrupted + config.imagined)
+        kind = jnp.where(within, 2, kind)
+        return jax.lax.switch(kind, (lambda: windows, corrupted, imagined))
+
+    keys = clip_keys(clip)
+    return jax.lax.map(one, (classes_BTXYZ, start_BT3, last, low[:, 0], first, keys))
+
+
+def clip_keys(clip: Clip) -> Array:
+    """Return (B,) keys that depend on the first cameras of clips."""
+    poses = jnp.asarray(clip.frames.camera.world_from_camera, jnp.float32)[:, 0, :3]
+    words = jax.lax.bitcast_convert_type(poses.reshape(len(poses), -1), jnp.uint32)
+
+    def key(words_N: Array) -> Array:
+        made = jax.random.key(0)
+        for word in words_N:
+            made = jax.random.fold_in(made, word)
+        return made
+
+    return jax.vmap(key)(words)
 
 
 def require_recorded(model: PersistModel, clip: Clip) -> None:

@@ -19,12 +19,14 @@ from pewm_jax.config import TrainSettings
 from pewm_jax.config.parts import Noise
 from pewm_jax.geometry.actions import camera_numbers, camera_steps_between
 from pewm_jax.geometry.march import RayHits
+from pewm_jax.memory.class_grid import UNKNOWN
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer, voxel_vae
 from pewm_jax.models.persist import nets as persist_nets
 from pewm_jax.models.persist.config import VoxelVAEConfig
 from pewm_jax.nn.tokens import patchify
 from pewm_jax.types import Array, Clip, Params
-from pewm_jax.worlds.persist import prepare
+from pewm_jax.worlds.persist import corruption, prepare, voxel_frames
+from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist.config import PersistModel, PersistTrainConfig
 from pewm_jax.worlds.persist.prepare import previous_frames
 from pewm_jax.worlds.persist.step import reckoned_steps
@@ -91,7 +93,10 @@ def world_frames(
     """Return the loss of stage ``world_frames``: the squared error of the velocity of latents.
 
     A frame is conditioned on the image and the camera of the frame before. Unknown latents are
-    noise at any time; later frames do not read them, and their error does not count.
+    noise at any time; later frames do not read them, and their error does not count. With
+    ``world_frames.map_embed`` a frame is also conditioned on a map of the cells observed up to it,
+    with or without guesses of the others (``drawn_map``); the error of latents with cells that the
+    map does not hold weighs ``train.new`` times as much.
     """
     assert isinstance(train, PersistTrainConfig)
     made = _prepared(prepare.frames, model, params, clip)
@@ -99,6 +104,17 @@ def world_frames(
     latents, pixels = made["latents"].astype(jnp.float32), made["told"].astype(jnp.float32)
     weight = 1 + (train.occupied - 1) * made["occupied"]
     velocity_key, shown_key = jax.random.split(key)
+    read, given = known, None
+    if config.map_embed:
+        map_key, velocity_key = jax.random.split(velocity_key)
+        given = drawn_map(model, train, made, map_key)
+        states = given[1]
+        new = prepare.any_in_latent(model, states == voxel_dit.ABSENT)
+        weight = weight * jnp.where(new, train.new, 1.0)
+        read = known & grid_state.any_in_token(model, states == voxel_dit.SEEN)
+    low, high = (at * config.patch for at in config.levels)
+    level = jnp.arange(config.latent_side)
+    known = known & (level >= low) & (level < high)
     shown = jax.random.uniform(shown_key, latents.shape[:2]) >= train.blind
     predict = functools.partial(
         voxel_dit.apply,
@@ -108,7 +124,8 @@ def world_frames(
         pixels_BThwC=previous_frames(pixels),
         camera_BTN=previous_frames(made["camera"]) if config.camera_numbers else None,
         shown_BT=shown | (jnp.arange(latents.shape[1]) == 0) if train.blind else None,
-        known_BTxyz=known,
+        known_BTxyz=read,
+        map_BTXYZ=given,
     )
 
     def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
@@ -126,6 +143,66 @@ def world_frames(
         counts=weight,
         compare=compare if train.classes else None,
     )
+
+
+def drawn_map(
+    model: PersistModel, train: PersistTrainConfig, made: dict[str, Array], key: Array
+) -> tuple[Array, Array]:
+    """Return ids and states (B, T, X, Y, Z) of the maps that condition the frames of clips.
+
+    The frames up to a drawn one are real: what they show is observed, and so are the cells of some
+    of the views before the clip. In some clips the other cells are guesses, the true cells with
+    errors (``corruption``), except, in some of these, at one side of the window.
+    """
+    classes, frames = made["classes"].astype(jnp.int32), made["classes"].shape[1]
+
+    def one(
+        classes: Array, seen: Array, before: Array, known: Array, key: Array
+    ) -> tuple[Array, Array]:
+        keys = jax.random.split(key, 6)
+        last = jax.random.randint(keys[0], (), 0, frames)
+        number = jnp.minimum(jnp.arange(frames), last)
+        share = jax.random.uniform(keys[1])
+        views = jax.random.bernoulli(keys[2], share, (prepare.VIEWS,))
+        bits = (views * (1 << jnp.arange(prepare.VIEWS))).sum().astype(jnp.uint8)
+        observed = (seen <= number[:, None, None, None]) | ((before & bits) != 0)
+        cells = classes[number]
+        guess_key, side_key, colour_key = jax.random.split(keys[3], 3)
+        guesses, entering = (
+            jax.random.bernoulli(k, p)
+            for k, p in zip(keys[4:], (train.guessed, train.entering), strict=True)
+        )
+        wrong = corruption.corrupt(classes[0], guess_key)
+        wrong = jnp.where(guesses, wrong, UNKNOWN)
+        absent = guesses & entering & _side(model, side_key)
+        ids = jnp.where(observed, cells, wrong)
+        ids = jnp.where(absent | (cells == UNKNOWN) | ~known, UNKNOWN, ids)
+        states = jnp.where(observed, voxel_dit.SEEN, voxel_dit.GUESS)
+        states = jnp.where(ids == UNKNOWN, voxel_dit.ABSENT, states)
+        # The kinds of surfaces that are observed for the first time are not known.
+        colours = voxel_frames.coloured_surface(model, (ids - 1) % model.memory.colours)
+        fresh = (seen == number[:, None, None, None]) | jax.random.bernoulli(colour_key)
+        coloured = fresh & (states == voxel_dit.SEEN) & (ids > 0)
+        return jnp.where(coloured, colours, ids), states
+
+    token = model.backbone.voxel_vae.factor
+    known = made["known"]
+    for axis in (-3, -2, -1):
+        known = jnp.repeat(known, token, axis)
+    keys = jax.random.split(key, len(classes))
+    return jax.vmap(one)(classes, made["seen"], made["before"], known, keys)
+
+
+def _side(model: PersistModel, key: Array) -> Array:
+    """Return (X, Y, Z) bool: one or two layers of tokens at one side of a window, drawn."""
+    axis_key, far_key, count_key = jax.random.split(key, 3)
+    token, side = model.backbone.token_cells, model.side
+    width = jax.random.randint(count_key, (), 1, 3) * token
+    at = jnp.where(jax.random.bernoulli(far_key), jnp.arange(side), side - 1 - jnp.arange(side))
+    within = at < width
+    by_x = jax.random.bernoulli(axis_key)
+    chosen = jnp.where(by_x, within[:, None], within[None])
+    return jnp.broadcast_to(chosen[..., None], (side,) * 3)
 
 
 def camera(
@@ -279,9 +356,12 @@ def latent_class_error(
 
 
 def _stage(
-    number: int, name: str, trained: str, networks: int, loss: Any, prepare: Any, **more: Any
+    number: int, name: str, trained: str, networks: int, loss: Any, prepare: Any, *reads: str
 ) -> Stage:
-    """Return a stage that trains the parameters of a pattern; all others are frozen."""
+    """Return a stage that trains the parameters of a pattern; all others are frozen.
+
+    To prepare its clips it ``reads`` parameters besides those of the two autoencoders.
+    """
     return Stage(
         name=name,
         number=number,
@@ -289,8 +369,7 @@ def _stage(
         init=functools.partial(init, networks=networks),
         loss=loss,
         prepare=prepare,
-        prepares_by=("backbone", "codec", "voxel_vae"),
-        **more,
+        prepares_by=("backbone", "codec", "voxel_vae", *reads),
     )
 
 
@@ -300,7 +379,7 @@ STAGES = (
     _stage(2, "voxel_statistics", STATISTICS, 1, distribute, prepare.grids),
     _stage(3, "world_frames", r"voxel_dit/.*", 2, world_frames, prepare.frames),
     _stage(4, "camera", r"camera_model/.*", 3, camera, prepare.cameras),
-    _stage(5, "renderer", r"renderer/.*", 4, renderer, prepare.layers),
+    _stage(5, "renderer", r"renderer/.*", 4, renderer, prepare.layers, "voxel_dit"),
 )
 """The stages, in order. The codec of images comes from ``train.start``: the world ``codec`` trains
 it."""

@@ -90,6 +90,22 @@ def known_latents(model: PersistModel, classes_XYZ: Array) -> Array:
     return repeat_tokens(known.all((1, 3, 5)), patch)
 
 
+def any_in_token(model: PersistModel, cells_XYZ: Array) -> Array:
+    """Return (..., x, y, z) bool: the latents of tokens that have such a cell."""
+    token, wide = model.backbone.token_cells, model.side
+    patch, count = model.backbone.world_frames.patch, wide // token
+    front = cells_XYZ.shape[:-3]
+    there = cells_XYZ.reshape(*front, count, token, count, token, count, token)
+    return repeat_tokens(there.any((-5, -3, -1)), patch)
+
+
+def predicted_levels(model: PersistModel) -> np.ndarray:
+    """Return (Z,) bool: the levels of a window's cells that the world frames predict."""
+    low, high = (at * model.backbone.token_cells for at in model.backbone.world_frames.levels)
+    level = np.arange(model.side)
+    return (level >= low) & (level < high)
+
+
 def repeat_tokens(known_xyz: Array, patch: int) -> Array:
     """Repeat the values of tokens for all their latents."""
     for axis in (-3, -2, -1):
@@ -101,14 +117,13 @@ def move_cache(
     model: PersistModel, cache: FrameCache, before_3: Array, after_3: Array
 ) -> FrameCache:
     """Return the cache of voxel frames for a window that has moved; new cells have no entries."""
-    token = model.backbone.token_cells
-    count = model.side // token
-    tokens = (after_3 - before_3) // token
-    places = np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    tokens = (after_3 - before_3) // model.backbone.token_cells
+    count_3 = np.array(model.backbone.world_frames.token_sides)
+    places = np.stack(np.meshgrid(*map(np.arange, count_3), indexing="ij"), -1).reshape(-1, 3)
     source = places + tokens
-    inside = ((source >= 0) & (source < count)).all(-1)
-    at = jnp.clip(source, 0, count - 1)
-    row = (at[:, 0] * count + at[:, 1]) * count + at[:, 2]
+    inside = ((source >= 0) & (source < count_3)).all(-1)
+    at = jnp.clip(source, 0, count_3 - 1)
+    row = (at[:, 0] * count_3[1] + at[:, 1]) * count_3[2] + at[:, 2]
 
     return FrameCache(
         jnp.take(cache.keys_LBSNKd, row, 3),

@@ -17,10 +17,10 @@ from pewm_jax.geometry.actions import (
     follow_camera_steps,
     step_pose,
 )
-from pewm_jax.memory.class_grid import ClassGrid
+from pewm_jax.memory.class_grid import EMPTY, OBSERVED, SHOWN, UNKNOWN, ClassGrid
 from pewm_jax.models.persist import camera_model, voxel_dit, voxel_renderer
 from pewm_jax.models.persist.blocks import FrameCache
-from pewm_jax.types import Array, Camera, Frames, Params
+from pewm_jax.types import Array, Camera, Frames, Params, View
 from pewm_jax.worlds.persist import state as grid_state
 from pewm_jax.worlds.persist import voxel_frames
 from pewm_jax.worlds.persist.config import PersistModel
@@ -28,6 +28,7 @@ from pewm_jax.worlds.persist.state import (
     History,
     KnownFrame,
     Past,
+    ShownPicture,
     decode_picture,
     encode_picture,
     noisy_context,
@@ -115,11 +116,52 @@ def draw_latents(
 
     ``corner_3`` is the window's lowest corner, metres.
     """
-    cells = ClassGrid(classes_XYZ, corner_3)
+    view = _draw(model, classes_XYZ, corner_3, camera)
+    return encode_picture(model, params, view.features_THWF[0], view.depth_THW[0])
+
+
+def _draw(model: PersistModel, classes_XYZ: Array, corner_3: Array, camera: Camera) -> View:
+    """Return the view (1, H, W) of a window's cells in the colours of their classes."""
     one = jax.tree.map(lambda x: x[None], camera)
+    cells = ClassGrid(classes_XYZ, corner_3)
     view = model.memory.render(model, cells, one, model.clip.height, model.clip.width)
     assert view is not None
-    return encode_picture(model, params, view.features_THWF[0], view.depth_THW[0])
+    return view
+
+
+def shown_cells(model: PersistModel, classes_XYZ: Array, corner_3: Array, camera: Camera) -> Array:
+    """Return (X, Y, Z) bool: the cells of a window that its own view shows, empty or filled."""
+    depth = _draw(model, classes_XYZ, corner_3, camera).depth_THW[0]
+    air, surface = voxel_frames.visible_cells(model, corner_3, depth, camera)
+    return air | surface
+
+
+def marked(
+    model: PersistModel,
+    grid: ClassGrid,
+    start_3: Array,
+    classes_XYZ: Array,
+    evidence: ObservedCells | None,
+    camera: Camera | None = None,
+) -> Array | None:
+    """Return a world's mask after a frame: what was observed stays observed.
+
+    ``evidence`` is that of a real frame. An imagined frame, of ``camera``, marks the cells of the
+    window that it shows, if guesses that were shown count otherwise than those that were not.
+    """
+    if grid.mask_XYZ is None:
+        return None
+    mask = grid_state.window(model, grid.mask_XYZ, start_3)
+    if evidence is not None:  # cells whose class contradicts it were not understood
+        filled = classes_XYZ > EMPTY
+        seen = jnp.where(filled, evidence.colour_XYZ >= 0, evidence.air_XYZ)
+        mask = jnp.where(seen, jnp.uint8(OBSERVED), mask)
+    guess, shown, _ = model.kept_logits
+    if camera is not None and guess != shown:
+        corner = grid.low_3 + start_3 * model.cell
+        seen = shown_cells(model, classes_XYZ, corner, jax.lax.stop_gradient(camera))
+        mask = jnp.where(seen, jnp.maximum(mask, jnp.uint8(SHOWN)), mask)
+    return grid_state.write_window(grid.mask_XYZ, mask, start_3)
 
 
 Render = Callable[[Array, Array], tuple[Array, FrameCache]]
@@ -176,38 +218,60 @@ def begin(
 ) -> Past:
     """Return the world at its first frame (1,); unknown cells of its window are generated.
 
-    A ``real`` frame is evidence of its voxels (``model.observation_logit``).
+    A ``real`` frame is evidence of its voxels.
     """
     camera = jax.tree.map(lambda x: x[0], frame.camera)
     latents = encode_picture(model, params, frame.rgb_THWC[0], frame.depth_THW[0])
     shown = grid_state.shown_picture(latents, frame.depth_THW[0], camera)
-    nets = model.backbone
-    dtype = jnp.dtype(model.dtype)
     start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
-    history = History(
-        voxel_dit.empty_cache(nets.world_frames, 1, dtype),
-        camera_model.empty_cache(nets.camera_model, 1, dtype),
-        voxel_renderer.empty_cache(nets.renderer, 1, dtype),
-        jnp.zeros((model.control.actions,)),
-        shown,
-        start,
-    )
+    history = _no_history(model, shown, start)
     voxel_key, picture_key = jax.random.split(key)
     before = grid_state.window(model, grid.classes_XYZ, start)
     middle = grid_state.middle(model, grid.low_3, start)
     evidence = None
     if real:
         evidence = _evidence(model, grid, start, frame.rgb_THWC[0], frame.depth_THW[0], camera)
+    mask = _mask_window(model, grid, start)
     made = voxel_frames.sample(
-        model, params, history, history.voxels, middle, before, voxel_key, evidence
+        model, params, history, history.voxels, middle, before, voxel_key, evidence, mask
     )
     classes = jnp.where(before >= 0, before, made)  # a known grid is not changed by its picture
     everything = grid_state.write_window(grid.classes_XYZ, classes, start)
+    everywhere = marked(model, grid, start, classes, evidence)
     seen = features(model, params, classes, grid.low_3, start, camera)
     render = renderer(model, params, seen, history.action_A, history.pictures)
     pictures = add_picture(model, render, latents, picture_key)
     history = dataclasses.replace(history, pictures=pictures)
-    return Past(ClassGrid(everything, grid.low_3, history), shown)
+    return Past(ClassGrid(everything, grid.low_3, history, everywhere), shown)
+
+
+def _no_history(model: PersistModel, shown: ShownPicture, start_3: Array) -> History:
+    """Return the networks' empty caches before the first frame."""
+    nets, dtype = model.backbone, jnp.dtype(model.dtype)
+    return History(
+        voxel_dit.empty_cache(nets.world_frames, 1, dtype),
+        camera_model.empty_cache(nets.camera_model, 1, dtype),
+        voxel_renderer.empty_cache(nets.renderer, 1, dtype),
+        jnp.zeros((model.control.actions,)),
+        shown,
+        start_3,
+    )
+
+
+def imagine_window(
+    model: PersistModel, params: Params, grid: ClassGrid, frame: Frames, key: Array
+) -> Array:
+    """Return the cells of a grid as large as a window, generated from one real image (H, W)."""
+    start, camera = jnp.zeros(3, jnp.int32), frame.camera
+    latents = encode_picture(model, params, frame.rgb_THWC, frame.depth_THW)
+    shown = grid_state.shown_picture(latents, frame.depth_THW, camera)
+    history = _no_history(model, shown, start)
+    evidence = _evidence(model, grid, start, frame.rgb_THWC, frame.depth_THW, camera)
+    middle = grid_state.middle(model, grid.low_3, start)
+    cells, mask = grid.classes_XYZ, grid.mask_XYZ
+    return voxel_frames.sample(
+        model, params, history, history.voxels, middle, cells, key, evidence, mask
+    )
 
 
 def step(
@@ -234,19 +298,31 @@ def step(
     middle = grid_state.middle(model, grid.low_3, start)
     before = grid_state.window(model, grid.classes_XYZ, start)
     cache = grid_state.move_cache(model, history.voxels, history.start_3, start)
-    cache = voxel_frames.add_present(model, params, history, cache, middle, before, keys[0])
+    mask = _mask_window(model, grid, start)
+    cache = voxel_frames.add_present(model, params, history, cache, middle, before, keys[0], mask)
     now = dataclasses.replace(history, action_A=action_A, shown=past.shown)
-    classes = known.classes_XYZ
+    classes, evidence, real = known.classes_XYZ, None, known.rgb_HWC is not None
     if classes is None:
-        evidence = None
         if known.rgb_HWC is not None and known.depth_HW is not None:
             evidence = _evidence(model, grid, start, known.rgb_HWC, known.depth_HW, camera)
-        classes = voxel_frames.sample(model, params, now, cache, middle, before, keys[1], evidence)
+
+        def sampled() -> Array:
+            key = keys[1]
+            return voxel_frames.sample(
+                model, params, now, cache, middle, before, key, evidence, mask
+            )
+
+        if model.sampled == "always" or real:
+            classes = sampled()
+        else:
+            kept = before.astype(jnp.int32)
+            classes = jax.lax.cond((before == UNKNOWN).any(), sampled, lambda: kept)
     everything = grid_state.write_window(grid.classes_XYZ, classes, start)
     made, cameras = next_camera(
         model, params, everything, grid.low_3, here, action_A, history.cameras
     )
     camera = made if known.camera is None else camera
+    everywhere = marked(model, grid, start, classes, evidence, None if real else camera)
     seen = features(model, params, classes, grid.low_3, start, camera)
     render = renderer(model, params, seen, action_A, history.pictures)
     if known.rgb_HWC is None:
@@ -260,11 +336,16 @@ def step(
         now, voxels=cache, cameras=cameras, pictures=pictures, start_3=start
     )
     after = Past(
-        ClassGrid(everything, grid.low_3, history),
+        ClassGrid(everything, grid.low_3, history, everywhere),
         grid_state.shown_picture(latents, depth, camera),
     )
     one = jax.tree.map(lambda x: x[None], (rgb, depth, camera))
     return after, Frames(*one)
+
+
+def _mask_window(model: PersistModel, grid: ClassGrid, start_3: Array) -> Array | None:
+    """Return the mask of a window's cells, if the world keeps one."""
+    return None if grid.mask_XYZ is None else grid_state.window(model, grid.mask_XYZ, start_3)
 
 
 def _evidence(
@@ -275,8 +356,10 @@ def _evidence(
     depth_HW: Array,
     camera: Camera,
 ) -> ObservedCells | None:
-    """Return the evidence of a real image, if ``model.observation_logit`` uses it."""
-    if not model.observation_logit:
+    """Return the evidence of a real image, if the model uses it and has depth."""
+    guess, shown, observed = model.kept_logits
+    used = model.observation_logit or model.backbone.world_frames.map_embed
+    if not model.clip.depth or not (used or guess != observed or shown != observed):
         return None
     corner = grid.low_3 + start_3 * model.cell
     return voxel_frames.observe_cells(model, corner, rgb_HWC, depth_HW, camera)

@@ -1,13 +1,14 @@
 """Voxel frames of the world ``persist``: sampling of the next one (arXiv 2603.03482).
 
 The present voxels are encoded and enter the transformer's cache. The next ones are sampled from
-noise; ``model.persistence_logit`` favours the previous class of a cell.
+noise; ``model.kept_logits`` favour the previous class of a cell, by whether it was observed. With
+``world_frames.map_embed`` the cells of the map and their mask are an input of the transformer.
 
-In a world of blocks (``memory.pictures cells``) a real image is further evidence, without a
-network: its depth shows which cells are empty and which hold a surface, and a surface has the
-image's colour without the light on it. ``model.observation_logit`` is the advantage, in nats, that
-such evidence gives a class when voxels are sampled for a real frame. Imagined frames are rendered
-from the voxels, so they are no evidence. Not as published.
+A real image is further evidence, without a network: its depth shows which cells are empty and which
+hold a surface; these count as observed. In a world of blocks (``memory.pictures cells``) a surface
+has the image's colour without the light on it. ``model.observation_logit`` is the advantage, in
+nats, that such evidence gives a class when voxels are sampled for a real frame. Imagined frames are
+rendered from the voxels, so they are no evidence. Not as published.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pewm_jax.data.voxels import PALETTE
 from pewm_jax.geometry import march
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
-from pewm_jax.memory.class_grid import EMPTY, UNKNOWN
+from pewm_jax.memory.class_grid import EMPTY, OBSERVED, UNKNOWN
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.nn.layers import linear
@@ -42,16 +43,20 @@ def sample(
     before_XYZ: Array,
     key: Array,
     evidence: ObservedCells | None = None,
+    mask_XYZ: Array | None = None,
 ) -> Array:
     """Sample a voxel frame: (X, Y, Z) class ids.
 
     ``history`` gives the action that leads to the frame and the image that conditions it, ``cache``
-    those of the frames before. ``middle_3`` is the middle of the window, metres, and ``before_XYZ``
-    its previous cells, to which ``model.persistence_logit`` applies where they are known.
+    those of the frames before. ``middle_3`` is the middle of the window, metres, ``before_XYZ`` are
+    its previous cells, and ``mask_XYZ`` states where these come from (``memory.class_grid``).
     ``evidence`` is that of a real image of this frame.
     """
     config, noise = model.backbone.world_frames, model.voxel_noise
     asked = _condition(model, history, middle_3)
+    if config.map_embed:
+        ids, states = map_input(model, before_XYZ, mask_XYZ, evidence)
+        asked["map_BTXYZ"] = ids[None, None], states[None, None]
     shape = (1, 1, *(config.latent_side,) * 3, config.latent_channels)
 
     def denoise(x: Array, time_B: Array, weight: Array) -> Array:
@@ -65,7 +70,43 @@ def sample(
         return noise.to_x0(made.astype(jnp.float32), x, times)
 
     latents = noise.sample(denoise, jax.random.normal(key, shape))[:, 0]
-    return decode_classes(model, params, latents, before_XYZ, evidence)
+    return decode_classes(model, params, latents, before_XYZ, evidence, mask_XYZ)
+
+
+def map_input(
+    model: PersistModel,
+    before_XYZ: Array,
+    mask_XYZ: Array | None,
+    evidence: ObservedCells | None,
+) -> tuple[Array, Array]:
+    """Return the ids and states (X, Y, Z) of a map's cells as the transformer's input.
+
+    Cells of which a real image gives ``evidence`` are observed. Of the kind of a surface it says
+    nothing: such a cell has the id of a surface of its colour, unless the map knows its class.
+    """
+    before = before_XYZ.astype(jnp.int32)
+    seen = jnp.zeros(before.shape, bool) if mask_XYZ is None else mask_XYZ == OBSERVED
+    states = jnp.where(seen, voxel_dit.SEEN, voxel_dit.GUESS)
+    states = jnp.where(before == UNKNOWN, voxel_dit.ABSENT, states)
+    if evidence is None:
+        return before, states
+    surface = evidence.colour_XYZ >= 0
+    alike = surface & seen & (before > EMPTY)
+    if model.memory.pictures == "cells":
+        alike = alike & ((before - 1) % model.memory.colours == evidence.colour_XYZ)
+    ids = jnp.where(surface & ~alike, coloured_surface(model, evidence.colour_XYZ), before)
+    ids = jnp.where(evidence.air_XYZ, EMPTY, ids)
+    return ids, jnp.where(surface | evidence.air_XYZ, voxel_dit.SEEN, states)
+
+
+def coloured_surface(model: PersistModel, colour: Array) -> Array:
+    """Return the id, in the map's input, of a surface of a colour whose kind is not known.
+
+    Images of surfaces do not show the colours of classes: there all colours have the same id.
+    """
+    colours = model.memory.colours
+    known = colour if model.memory.pictures == "cells" else jnp.full_like(colour, colours)
+    return model.backbone.voxel_vae.classes + known
 
 
 def decode_classes(
@@ -74,35 +115,48 @@ def decode_classes(
     latents_BxyzC: Array,
     before_XYZ: Array,
     evidence: ObservedCells | None = None,
+    mask_XYZ: Array | None = None,
 ) -> Array:
     """Return the class ids (X, Y, Z) of latents (1, …).
 
-    A cell whose class was known changes only if another class is likelier by
-    ``model.persistence_logit``. An unknown cell is empty unless a class is likelier by
-    ``model.empty_prior``. ``model.observation_logit`` is added to the class that a real image
-    shows.
+    A cell whose class was known changes only if another class is likelier by the nats of
+    ``model.kept_logits``; without ``mask_XYZ`` all known cells count as observed. An unknown cell
+    is empty unless a class is likelier by ``model.empty_prior``, or if it lies on a level that is
+    not predicted. ``model.observation_logit`` is added to the class that a real image shows.
     """
     config = model.backbone.voxel_vae
     weights, dtype = params["voxel_vae"], jnp.dtype(model.dtype)
     looked = evidence is not None and model.observation_logit > 0
-    if not model.persistence_logit and not model.empty_prior and not looked:
-        return voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
+    if not any(model.kept_logits) and not model.empty_prior and not looked:
+        made = voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
+        return _within_storey(model, made, before_XYZ)
     features = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
+    mask = jnp.full(before_XYZ.shape, OBSERVED, jnp.uint8) if mask_XYZ is None else mask_XYZ
+    kept = jnp.asarray(model.kept_logits, jnp.float32)
 
-    def likeliest(slab: tuple[Array, Array, ObservedCells | None]) -> Array:
-        features, before, evidence = slab
+    def likeliest(slab: tuple[Array, Array, Array, ObservedCells | None]) -> Array:
+        features, before, mask, evidence = slab
         scores = linear(weights["decoder"]["scores"], features).astype(jnp.float32)
         number, before = jnp.arange(config.classes), before[..., None]
-        scores = scores + model.persistence_logit * (number == before)
+        scores = scores + kept[mask][..., None] * (number == before)
         scores = scores + model.empty_prior * ((before == UNKNOWN) & (number == EMPTY))
         if evidence is not None:
             scores = scores + evidence_logits(model, evidence, config.classes)
         return scores.argmax(-1).astype(jnp.int32)
 
     slab = config.slab or config.side
-    whole = features, before_XYZ.astype(jnp.int32), evidence if looked else None
+    whole = features, before_XYZ.astype(jnp.int32), mask, evidence if looked else None
     cut = jax.tree.map(lambda x: x.reshape(-1, slab, *x.shape[1:]), whole)
-    return jax.lax.map(likeliest, cut).reshape(before_XYZ.shape)
+    made = jax.lax.map(likeliest, cut).reshape(before_XYZ.shape)
+    return _within_storey(model, made, before_XYZ)
+
+
+def _within_storey(model: PersistModel, made_XYZ: Array, before_XYZ: Array) -> Array:
+    """Return cells of which those on levels that are not predicted are as before, or empty."""
+    if model.backbone.world_frames.storey == (0, 0):
+        return made_XYZ
+    before = jnp.maximum(before_XYZ, EMPTY).astype(made_XYZ.dtype)
+    return jnp.where(grid_state.predicted_levels(model), made_XYZ, before)
 
 
 def add_present(
@@ -113,11 +167,20 @@ def add_present(
     middle_3: Array,
     classes_XYZ: Array,
     key: Array,
+    mask_XYZ: Array | None = None,
 ) -> FrameCache:
-    """Encode the present voxels and add them to the cache; unknown ones are noise."""
+    """Encode the present voxels and add them to the cache; unknown ones are noise.
+
+    If the map is an input, later frames read observed tokens only: guesses are in the map.
+    """
     config, noise = model.backbone.world_frames, model.voxel_noise
     vae, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)
     known = grid_state.known_latents(model, classes_XYZ)
+    condition, read = _condition(model, history, middle_3), known
+    if config.map_embed:
+        ids, states = map_input(model, classes_XYZ, mask_XYZ, None)
+        condition["map_BTXYZ"] = ids[None, None], states[None, None]
+        read = known & grid_state.any_in_token(model, states == voxel_dit.SEEN)
     ids = jnp.maximum(classes_XYZ, 0).astype(jnp.int32)
     latents = voxel_vae.encode(vae, params["voxel_vae"], ids[None], dtype)[:, None]
     noise_key, unknown_key = jax.random.split(key)
@@ -129,8 +192,8 @@ def add_present(
         params["voxel_dit"],
         inputs.astype(dtype),
         network_times,
-        **_condition(model, history, middle_3),
-        known_BTxyz=known[None, None],
+        **condition,
+        known_BTxyz=read[None, None],
         cache=cache,
     )  # type: ignore[assignment]
     return cache
@@ -189,15 +252,8 @@ def observe_cells(
     """
     size, side = model.cell, model.side
     eye = camera.world_from_camera[:3, 3]
-    way_HW3 = unproject(depth_HW, camera) - eye
-    metres_HW1 = jnp.linalg.norm(way_HW3, axis=-1, keepdims=True)
-    behind_HW3 = way_HW3 * (1 + INTO_M / jnp.maximum(metres_HW1, INTO_M)) + (eye - corner_3)
-    at = jnp.floor(behind_HW3 / size).astype(jnp.int32)
-    met = (depth_HW > 0) & ((at >= 0) & (at < side)).all(-1)
-    cell = jnp.where(met, (at[..., 0] * side + at[..., 1]) * side + at[..., 2], side**3)
-    cell = cell.reshape(-1)
-    hits = jnp.zeros(side**3 + 1, jnp.int32).at[cell].add(1)[:-1]
-    surface = (hits >= VOTES).reshape((side,) * 3)
+    cell, way_HW3 = _cells_met(model, corner_3, depth_HW, camera)
+    air, surface = _air_and_surface(model, corner_3, depth_HW, camera, cell)
 
     # The light on visible cells is known, and so are their own colours.
     borders = march.side_of((way_HW3 + (eye - corner_3)) / size)
@@ -208,8 +264,42 @@ def observe_cells(
     votes = jnp.zeros((side**3 + 1, colours), jnp.int32)
     votes = votes.at[cell, colour_HW.reshape(-1)].add(1)[:-1]
     colour = votes.argmax(-1).reshape((side,) * 3).astype(jnp.int32)
-    air = _cells_in_front(model, corner_3, depth_HW, camera) & ~surface
     return ObservedCells(air, jnp.where(surface, colour, -1))
+
+
+def visible_cells(
+    model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera
+) -> tuple[Array, Array]:
+    """Return which cells of a window depth shows to be empty and which to hold a surface, bool.
+
+    Arguments as for ``observe_cells``; depth may also be that of a rendered grid.
+    """
+    cell, _ = _cells_met(model, corner_3, depth_HW, camera)
+    return _air_and_surface(model, corner_3, depth_HW, camera, cell)
+
+
+def _cells_met(
+    model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera
+) -> tuple[Array, Array]:
+    """Return the flat index of the cell that each pixel shows, side³ if none, and the rays."""
+    size, side = model.cell, model.side
+    eye = camera.world_from_camera[:3, 3]
+    way_HW3 = unproject(depth_HW, camera) - eye
+    metres_HW1 = jnp.linalg.norm(way_HW3, axis=-1, keepdims=True)
+    behind_HW3 = way_HW3 * (1 + INTO_M / jnp.maximum(metres_HW1, INTO_M)) + (eye - corner_3)
+    at = jnp.floor(behind_HW3 / size).astype(jnp.int32)
+    met = (depth_HW > 0) & ((at >= 0) & (at < side)).all(-1)
+    cell = jnp.where(met, (at[..., 0] * side + at[..., 1]) * side + at[..., 2], side**3)
+    return cell.reshape(-1), way_HW3
+
+
+def _air_and_surface(
+    model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera, cell_P: Array
+) -> tuple[Array, Array]:
+    side = model.side
+    hits = jnp.zeros(side**3 + 1, jnp.int32).at[cell_P].add(1)[:-1]
+    surface = (hits >= VOTES).reshape((side,) * 3)
+    return _cells_in_front(model, corner_3, depth_HW, camera) & ~surface, surface
 
 
 def _cells_in_front(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:

@@ -22,7 +22,7 @@ from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import UserError, register
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.memory import interface as memories
-from pewm_jax.memory.class_grid import ClassGrid
+from pewm_jax.memory.class_grid import GUESSED, OBSERVED, ClassGrid
 from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds import checks
 from pewm_jax.worlds.control import control_of
@@ -96,7 +96,10 @@ class PERSIST(memories.MemoryEdits, PersistModel):
         """
         params = _as_arrays(params)[0]
         asked, steered = _steering(self, state.frame.camera, control)
-        begun = state if memory else _begin_from_frames(self, params, state.frame, real=False)
+        # If observed cells are an input, the present image is the only one of a world without 3D
+        # state; its cells count as observed.
+        real = self.backbone.world_frames.map_embed > 0
+        begun = state if memory else _begin_from_frames(self, params, state.frame, real=real)
         past = past_of(self, params, begun)
 
         def one(past: Past, inputs: tuple[Array, Camera, Array]) -> tuple[Past, Frames]:
@@ -158,7 +161,8 @@ def _start_in(
     shape = empty.classes_XYZ.shape
     given = grid_state.cut_box(given, off.astype(jnp.int32), shape)
     cells = jnp.where(given >= 0, given, empty.classes_XYZ)
-    return _begin(model, params, ClassGrid(cells, low), frames)
+    mask = jnp.where(given >= 0, jnp.uint8(OBSERVED), jnp.uint8(GUESSED))
+    return _begin(model, params, ClassGrid(cells, low, mask_XYZ=mask), frames)
 
 
 def edit(state: WorldState, change: Callable[..., ClassGrid], *arguments: Any) -> WorldState:

@@ -138,7 +138,7 @@ def test_gradients_of_a_frame_reach_no_later_action():
 
 def test_later_frames_do_not_read_unknown_tokens():
     x, condition = normal(2, 2, FRAMES, 5, BLOCKS.width), normal(3, 2, 1, BLOCKS.width)
-    params = {"time": weights(voxel_dit, DIT)["blocks"]["time"]}
+    params = {"blocks": {"time": weights(voxel_dit, DIT)["blocks"]["time"]}}
     known = jnp.ones((2, FRAMES, 5), bool).at[:, 1, 2].set(False)
 
     @jax.jit
@@ -180,7 +180,7 @@ def test_networks_begin_at_zero_and_blocks_as_the_identity():
         for gates in ("zero", "open"):
             config = dataclasses.replace(BLOCKS, gates=gates)
             params = frame_blocks.init(config, ("time",), ends, key)
-            moved, _ = frame_blocks.run(config, ("time",), params["blocks"], x, condition)
+            moved, _ = frame_blocks.run(config, ("time",), params, x, condition)
             made.append((moved, frame_blocks.project(params, moved, condition)))
         return made
 

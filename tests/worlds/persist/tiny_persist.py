@@ -1,4 +1,6 @@
-"""The smallest world of PERSIST."""
+"""The smallest worlds of PERSIST."""
+
+import dataclasses
 
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import ClipConfig
@@ -47,3 +49,24 @@ MODEL = PERSIST(
     points=True,
     dead_reckoning=True,
 )  # fmt: skip
+"""As published, with the settings of small networks."""
+
+
+def _masked() -> PERSIST:
+    nets = MODEL.backbone
+    blocks = dataclasses.replace(BLOCKS, modulation="shared", gates="open")
+    frames = dataclasses.replace(
+        nets.world_frames, map_embed=2, map_ids=15, map_cells=2, storey=(0, 3), blocks=blocks
+    )
+    view = dataclasses.replace(nets.renderer, corrupted=0.4, imagined=0.4)
+    return dataclasses.replace(
+        MODEL,
+        backbone=dataclasses.replace(nets, world_frames=frames, renderer=view),
+        voxel_noise=FrameFlowConfig(per_frame=True, sample_steps=2, predicts="x0"),
+        guess_logit=0.0,
+        sampled="new",
+    )
+
+
+MASKED = _masked()
+"""With a mask of observed cells as an input, and guesses that can be revised."""

@@ -1,0 +1,96 @@
+"""PERSIST for hours of two CPU cores: houses of blocks at 64×64 pixels, with observed cells.
+
+The sizes of ``persist_tiny``, except that the world frames have tokens of 1 m, a mask of observed
+cells, eight sampling steps and a map whose guesses can be revised.
+"""
+
+import dataclasses
+
+from pewm_jax.config import ClipConfig, Config, EvalConfig, StageConfig
+from pewm_jax.models.persist.config import BlocksConfig, VoxelDiTConfig
+from pewm_jax.presets import persist_tiny
+
+
+def config() -> Config:
+    """Return the settings of ``persist``.
+
+    Its data: ``pewm-jax data collect data/persist_houses --moving --voxels --voxels.kinds groups
+    --voxels.colours 8 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 512
+    --validation 8 --test 16 --frames 64``. The codec of images is the one that comes with the
+    library. Prepared clips are kept on disk, so that training can be spread over as many sittings
+    as it takes.
+    """
+    base = persist_tiny.config()
+    model, nets = base.model, base.model.backbone
+    vae = dataclasses.replace(nets.voxel_vae, widths=(192,), cubes=24)
+    small = {"mlp_ratio": 2, "gates": "open", "modulation": "shared"}
+    frames = VoxelDiTConfig(
+        latent_side=vae.latent_side,
+        latent_channels=vae.latent_channels,
+        patch=2,
+        actions=3,
+        pixel_channels=nets.world_frames.pixel_channels,
+        pixel_patch=1,
+        map_embed=8,
+        map_ids=vae.classes + model.memory.colours + 1,
+        map_cells=vae.factor,
+        storey=(2, 6),  # 8 to 24 cells: from the floor to 3 m above it
+        blocks=BlocksConfig(layers=5, heads=4, head_dim=32, context=4, **small),
+    )
+    renderer = dataclasses.replace(
+        nets.renderer,
+        corrupted=0.35,
+        imagined=0.25,
+        blocks=BlocksConfig(layers=3, heads=4, head_dim=32, context=3, **small),
+    )
+    camera = dataclasses.replace(
+        nets.camera_model,
+        blocks=dataclasses.replace(nets.camera_model.blocks, modulation="shared"),
+    )
+    voxels = dataclasses.replace(
+        model.voxel_noise,
+        times="logit_normal",
+        shifted_times=True,
+        history=0.25,
+        sample_steps=8,
+        shift=3.0,
+    )
+    backbone = dataclasses.replace(
+        nets, voxel_vae=vae, world_frames=frames, renderer=renderer, camera_model=camera
+    )
+    return dataclasses.replace(
+        base,
+        model=dataclasses.replace(
+            model,
+            clip=ClipConfig(frames=4, height=64, width=64),
+            backbone=backbone,
+            voxel_noise=voxels,
+            shown_logit=8.0,
+            guess_logit=2.0,
+            sampled="new",
+        ),
+        data=dataclasses.replace(
+            base.data,
+            path="data/persist_houses",
+            stride_max=2,
+            prepared=1440,
+            prepared_path="data/persist_prepared",
+            refresh=8,
+        ),
+        train=dataclasses.replace(
+            base.train,
+            run="runs/persist",
+            voxel_vae=StageConfig(
+                steps=4000, batch=4, learning_rate=4e-3, warmup=50, optimizer="adam"
+            ),
+            voxel_statistics=StageConfig(steps=60, batch=8, learning_rate=0.05, warmup=0),
+            world_frames=StageConfig(steps=4500, batch=12, learning_rate=1.5e-3, warmup=50),
+            camera=StageConfig(steps=200, batch=16, learning_rate=1e-3, warmup=20),
+            renderer=StageConfig(steps=4000, batch=8, learning_rate=1.5e-3, warmup=50),
+            new=10.0,
+            occupied=3.0,
+            classes=1.0,
+            ema=0.995,
+        ),
+        evaluate=EvalConfig(clips=24, chain=5, seeds=(0,), videos=4, video_clips=11, batch=8),
+    )

@@ -1,0 +1,212 @@
+"""Plan edits of a generated house that a recorded walk reaches from another room.
+
+An edit is made while the agent is in another room than the edited one: a wall is moved, a door
+opened, or a chair removed. The walk then leads to where the edit can be seen. Episodes and frames
+are the first ones that fit, so nothing is selected by how a world draws it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from pewm_jax.data.episodes import Episode
+from pewm_jax.eval.voxel_scores import house_of
+from pewm_jax.houses.floorplan import DOOR_TOP_M
+from pewm_jax.houses.generate import object_boxes
+from pewm_jax.houses.kinds import kind_of
+from pewm_jax.memory import class_grid
+from pewm_jax.types import WorldState
+from pewm_jax.worlds.persist import world as persist
+
+KINDS = ("wall", "door", "chair")
+CHAIRS = ("chair", "armchair", "office_chair")
+"""Kinds of furniture that count as chairs."""
+MOVED_M = 1.0
+"""Distance by which a wall is moved into its room, metres."""
+LONGEST, AFTER = 48, 10
+"""Most frames between an edit and the first view of it, and frames that follow."""
+NEAR_M, FAR_M = 0.8, 3.5
+"""Distances from which an edited place is seen."""
+ASIDE = 0.7
+"""Largest tangent of the angle between the place and the middle of the image."""
+REACH_M = 4.5
+"""Largest distance of the place from the grid's middle when the edit is made, along an axis."""
+CLEAR_M = 0.5
+"""Distance that a moved wall keeps from the walk."""
+BESIDE_M = 0.12
+"""Distance around a chair that is emptied with it, metres."""
+AGREES_M = 0.45
+"""Largest difference between the place's depth and that measured in its direction."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """An edit of a walk.
+
+    Attributes:
+        about: what is edited.
+        start: frame at which the edit is made.
+        end: last frame of the walk.
+        box_23: the box that is emptied or moved, metres.
+        move: rigid (4, 4) by which its content moves; None if it is removed.
+    """
+
+    about: str
+    start: int
+    end: int
+    box_23: np.ndarray
+    move: np.ndarray | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """A place that could be edited: its rooms, a point that is looked at, and the edit."""
+
+    rooms: tuple[int, ...]
+    point_3: np.ndarray
+    box_23: np.ndarray
+    about: str
+    move: np.ndarray | None = None
+
+
+def apply(model: Any, state: WorldState, plan: Plan) -> WorldState:
+    """Return a world with the edit."""
+    box = plan.box_23.astype(np.float32)
+    if plan.move is None:
+        return persist.edit(state, class_grid.erase, model.memory, box)
+    return persist.edit(state, class_grid.move, model.memory, box, plan.move.astype(np.float32))
+
+
+def plan(model: Any, episode: Episode, kind: str) -> Plan | None:
+    """Return the first edit of a kind that a walk reaches from another room; None if there is none.
+
+    The episode must have voxels and actions; scenes other than generated houses have no plan.
+    """
+    house = house_of(episode.scene)
+    if house is None or episode.actions is None:
+        return None
+    floor = float(episode.world_from_camera[0, 2, 3]) - model.memory.eye_m
+    path = np.asarray(episode.world_from_camera)[:, :3, 3]
+    rooms = np.array([_room_at(house, xy) for xy in path[:, :2]])
+    for place in _places(house, kind, floor, model.cell):
+        found = _walk_to(episode, place, path, rooms)
+        if found is None:
+            continue
+        start, end = found
+        if kind == "wall" and not _is_clear(place, path[start : end + 1]):
+            continue
+        if kind == "door" and not _is_closed(episode, start, place.box_23):
+            continue
+        return Plan(place.about, start, end, place.box_23, place.move)
+    return None
+
+
+def _room_at(house: Mapping[str, Any], xy: np.ndarray) -> int:
+    for number, (x0, y0, x1, y1) in enumerate(house["rooms"]):
+        if x0 <= xy[0] <= x1 and y0 <= xy[1] <= y1:
+            return number
+    return -1  # in a doorway
+
+
+def _places(house: Mapping[str, Any], kind: str, floor_z: float, cell_m: float) -> Iterator[_Place]:
+    if kind == "chair":
+        yield from _chairs(house, floor_z)
+    elif kind == "door":
+        for a, b, x0, y0, x1, y1 in house["doorways"]:
+            # The leaf lies in the surface of the wall, so its cells may be those beside it.
+            low = np.array([x0 - cell_m, y0 - cell_m, floor_z])
+            high = np.array([x1 + cell_m, y1 + cell_m, floor_z + DOOR_TOP_M])
+            along = int(y1 - y0 > x1 - x0)
+            low[along] += 1.5 * cell_m
+            high[along] -= 1.5 * cell_m
+            middle = np.array([(x0 + x1) / 2, (y0 + y1) / 2, floor_z + 1.0])
+            yield _Place((int(a), int(b)), middle, np.stack([low, high]), "the door is opened")
+    else:
+        yield from _walls(house, floor_z, cell_m)
+
+
+def _chairs(house: Mapping[str, Any], floor_z: float) -> Iterator[_Place]:
+    for node, (low, high) in object_boxes(int(house["seed"])).items():
+        if kind_of(node) not in CHAIRS or "face" in node:
+            continue
+        box = np.stack([low - BESIDE_M, high + BESIDE_M])
+        box[0, 2] = floor_z + 0.02
+        room = int(node.removeprefix("room").split("-")[0])
+        yield _Place((room,), box.mean(0), box, "the chair is removed")
+
+
+def _walls(house: Mapping[str, Any], floor_z: float, cell_m: float) -> Iterator[_Place]:
+    """Yield the walls of rooms without the corners; a wall's cells lie in front of its surface."""
+    for number, rect in enumerate(house["rooms"]):
+        for side in range(4):
+            axis, far = side % 2, side // 2
+            low, high = np.array([*rect[:2], floor_z + 0.02]), np.array([*rect[2:], floor_z + 3.0])
+            inward = -1.0 if far else 1.0
+            low[axis] = high[axis] = rect[axis + 2 * far]
+            # The cell that contains the surface may begin up to a cell before it.
+            low[axis] -= cell_m
+            high[axis] += cell_m
+            other = 1 - axis
+            low[other] += 2 * cell_m
+            high[other] -= 2 * cell_m
+            if high[other] - low[other] < 1.0:
+                continue
+            move = np.eye(4)
+            move[axis, 3] = inward * MOVED_M
+            middle = np.array([(rect[0] + rect[2]) / 2, (rect[1] + rect[3]) / 2, floor_z + 1.25])
+            middle[axis] = rect[axis + 2 * far]
+            yield _Place((number,), middle, np.stack([low, high]), "the wall is moved by 1 m", move)
+
+
+def _walk_to(
+    episode: Episode, place: _Place, path_T3: np.ndarray, rooms_T: np.ndarray
+) -> tuple[int, int] | None:
+    """Return the frame at which to edit and the last one: the first walk that shows the place."""
+    for seen in range(1, episode.length - 1):
+        if not _in_view(episode, seen, place.point_3):
+            continue
+        elsewhere = [
+            t for t in range(max(seen - LONGEST, 0), seen)
+            if rooms_T[t] >= 0 and rooms_T[t] not in place.rooms[:1]
+            and np.abs(place.point_3 - path_T3[t])[:2].max() <= REACH_M
+            and not _in_view(episode, t, place.point_3)
+        ]  # fmt: skip
+        if elsewhere:
+            return elsewhere[-1], min(seen + AFTER, episode.length - 1)
+    return None
+
+
+def _in_view(episode: Episode, frame: int, point_3: np.ndarray) -> bool:
+    """Return whether a frame shows a point: it is near, ahead, and nothing stands before it."""
+    pose = np.asarray(episode.world_from_camera[frame], np.float64)
+    x, y, z = (point_3 - pose[:3, 3]) @ pose[:3, :3]
+    if not NEAR_M <= z <= FAR_M or abs(x) > ASIDE * z:
+        return False
+    fx, fy, cx, cy = episode.intrinsics_4
+    column, row = int(x / z * fx + cx), int(y / z * fy + cy)
+    if not (0 <= column < episode.width and 0 <= row < episode.height):
+        return False
+    depth = episode.frames([frame]).depth_THW[0]
+    return bool(abs(depth[row, column] - z) < AGREES_M)
+
+
+def _is_clear(place: _Place, path_T3: np.ndarray) -> bool:
+    """Return whether a moved wall stays away from the walk, on the side of its room."""
+    assert place.move is not None
+    box = place.box_23 + place.move[:3, 3]
+    away = np.maximum(np.maximum(box[0] - path_T3, path_T3 - box[1]), 0)[:, :2]
+    return bool(np.linalg.norm(away, axis=-1).min() >= CLEAR_M)
+
+
+def _is_closed(episode: Episode, frame: int, box_23: np.ndarray) -> bool:
+    """Return whether the recorded grid of a frame has a door's leaf in a box."""
+    grid = episode.voxels([frame])
+    doors = [name.partition("/")[0] == "door" for name in grid.names]
+    at = np.floor((box_23 - grid.origin_T3[0]) / grid.cell_m).astype(int)
+    (x0, y0, z0), (x1, y1, z1) = np.clip(at, 0, grid.classes_TXYZ.shape[1])
+    cells = grid.classes_TXYZ[0, x0 : x1 + 1, y0 : y1 + 1, z0 : z1 + 1]
+    return bool(np.array(doors)[cells].sum() >= 12)

@@ -1,0 +1,276 @@
+"""Scores of voxel worlds: unseen walls, doorways, what is lost, and how they are reported."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pewm_jax import worlds
+from pewm_jax.config import Config, UserError
+from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.make_episode import CollectConfig, make_episode
+from pewm_jax.data.voxels import VoxelsConfig
+from pewm_jax.eval import horizon, voxel_edits, voxel_report, voxel_scores
+from pewm_jax.eval.voxel_scores import UnseenCells
+from pewm_jax.houses.generate import object_boxes
+from pewm_jax.houses.kinds import FURNITURE, kind_of
+from pewm_jax.memory import class_grid
+from pewm_jax.memory.class_grid import ClassGrid
+from pewm_jax.report import labels
+from pewm_jax.types import Camera, Frames, WorldState
+from pewm_jax.worlds.persist.config import PersistTrainConfig
+from tests.worlds.persist.tiny_persist import MASKED
+
+CONFIG = Config(model=MASKED, train=PersistTrainConfig())
+
+
+def cells(house, wall, made, unseen=None):
+    shape = np.ones_like(wall, bool) if unseen is None else unseen
+    return UnseenCells(house, shape, wall, made)
+
+
+def test_iou_counts_walls_of_unseen_cells_over_all_places():
+    wall = np.zeros((4, 4, 4), bool)
+    wall[0] = True
+    half = wall.copy()
+    half[0, :2] = False
+    unseen = np.ones((4, 4, 4), bool)
+    unseen[0, 2:] = False
+    assert voxel_scores.iou([cells("a", wall, wall)], [wall]) == 1
+    assert voxel_scores.iou([cells("a", wall, half)], [half]) == 0.5
+    assert voxel_scores.iou([cells("a", wall, half, unseen)], [half]) == 0
+    both = [cells("a", wall, wall), cells("b", wall, half)]
+    assert voxel_scores.iou(both, [wall, half]) == 24 / 32
+
+
+def test_the_prior_is_the_mean_layout_of_other_houses_at_its_best_threshold():
+    one, two = np.zeros((2, 2, 2), bool), np.zeros((2, 2, 2), bool)
+    one[0], two[0], two[1, 0] = True, True, True
+    some = [cells("a", one, one), cells("a", one, one), cells("b", two, one)]
+    first, again, last = voxel_scores.mean_layouts(some)
+    np.testing.assert_array_equal(first, two)  # of the other house
+    np.testing.assert_array_equal(again, two)
+    np.testing.assert_array_equal(last, one)
+    found = voxel_scores.unseen_scores(some)
+    assert found["iou"] == 12 / 14
+    assert found["prior"] == 12 / 18
+    assert (found["places"], found["houses"]) == (3, 2)
+    others = [cells("c", one, None), cells("d", two, None)]
+    np.testing.assert_allclose(voxel_scores.mean_layouts(some, others)[0], (one + 1.0 * two) / 2)
+    assert voxel_scores.unseen_scores(some, others)["prior"] == 12 / 14  # cut above one half
+
+
+def test_walls_are_classes_of_walls_in_any_colour():
+    names = ("empty", "wall/red", "door/red", "trim", "sofa/blue", "doorway/blue")
+    assert voxel_scores.wall_classes(names).tolist() == [False, True, False, True, False, True]
+
+
+def test_places_are_spread_over_episodes_and_frames():
+    some = [SimpleNamespace(length=20), SimpleNamespace(length=12), SimpleNamespace(length=4)]
+    found = voxel_scores.places(some, 5, 8)
+    assert len(found) == 4  # two of each episode that is long enough
+    assert [number for number, _ in found] == [0, 1, 0, 1]
+    assert all(7 <= at < some[number].length for number, at in found)
+    assert found[0][1] < found[2][1]
+
+
+def blank(side=24):
+    return ClassGrid(np.zeros((side, side, 8), np.int16), np.zeros(3, np.float32))
+
+
+def test_a_doorway_is_passable_if_two_lanes_are_free():
+    model = dataclasses.replace(
+        MASKED, memory=dataclasses.replace(MASKED.memory, cell_m=(0.25, 0.25, 0.25))
+    )
+    config = SimpleNamespace(model=model)
+    way = voxel_scores.way_through((2.0, 1.0, 2.12, 1.9), 0.0, 0.25)
+    assert way.shape[0] == 4
+    grid = blank()
+    assert voxel_scores.passable(config, grid, way)
+    grid.classes_XYZ[:, 5, 2] = 3  # one lane of four is blocked
+    assert voxel_scores.passable(config, grid, way)
+    grid.classes_XYZ[:, 6, 2] = 3
+    assert not voxel_scores.passable(config, grid, way)
+    grid = blank()
+    grid.classes_XYZ[:, :, 7] = 3  # a lintel above the head
+    assert voxel_scores.passable(config, grid, way)
+    outside = voxel_scores.cells_at(grid, 0.25, np.array([[-1.0, 0, 0], [0.1, 0.1, 1.8]]))
+    np.testing.assert_array_equal(outside, [-1, 3])
+
+
+@pytest.fixture(scope="module")
+def episode():
+    voxels = VoxelsConfig(
+        record=True, cell=0.5, side=12, kinds="groups", colours=1, pictures="cells"
+    )
+    config = CollectConfig(
+        "data", train=1, frames=12, size=16, moving=True, voxels=voxels, turn_around=1.0
+    )
+    return read_episode(make_episode(config, "train", 0))
+
+
+@pytest.mark.slow
+def test_recorded_windows_agree_with_what_frames_show(episode):
+    seen = episode.frames(range(4, 12))
+    found = voxel_scores.compare_window(CONFIG, episode, 11, seen)
+    assert found.house == episode.scene
+    assert found.unseen_XYZ.any()
+    assert not found.unseen_XYZ.all()
+    fewer = voxel_scores.compare_window(CONFIG, episode, 11, jax.tree.map(lambda x: x[-1:], seen))
+    assert (fewer.unseen_XYZ | ~found.unseen_XYZ).all()
+    assert fewer.unseen_XYZ.sum() > found.unseen_XYZ.sum()
+    assert voxel_scores.house_of("scene0000_00") is None
+    house = voxel_scores.house_of(episode.scene)
+    assert house is not None
+    for way in voxel_scores.open_doorways(CONFIG, episode, 11, 8):
+        assert way.shape[-1] == 3
+
+
+def pose(x, y, yaw):
+    made = np.eye(4, dtype=np.float32)
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    made[:3, :3] = [[sin, 0, cos], [-cos, 0, sin], [0, -1, 0]]
+    made[:3, 3] = x, y, 1.25
+    return made
+
+
+def frames(count, value=0.0):
+    camera = Camera(
+        np.tile(np.array([8, 8, 8, 8], np.float32), (count, 1)),
+        np.stack([pose(3, 3, 0.1 * k) for k in range(count)]),
+    )
+    shape = (count, 16, 16)
+    return Frames(np.full((*shape, 3), value, np.float32), np.ones(shape, np.float32), camera)
+
+
+def test_points_count_as_shown_in_front_of_the_depth():
+    seen = frames(1)
+    points = np.array([[3.5, 3, 1.25], [4.5, 3, 1.25], [2.5, 3, 1.25]])
+    np.testing.assert_array_equal(voxel_scores._points_shown(seen, points), [True, False, False])
+
+
+def test_long_walks_compare_what_is_seen_again_at_their_start_and_end(monkeypatch):
+    """A world that forgets: after the walk its frames are darker, and a doorway is walled up."""
+    way = voxel_scores.way_through((2.0, 2.0, 2.12, 4.0), 0.0, 0.5)
+
+    def start(model, params, seen):
+        grid = ClassGrid(jnp.zeros((24, 24, 8), jnp.int16), jnp.zeros(3))
+        return WorldState(jax.tree.map(lambda x: jnp.asarray(x[-1:]), seen), grid)
+
+    def imagine(model, params, state, control, key, **_):
+        dark = (state.map.classes_XYZ > 0).any()
+        steps = control if not hasattr(control, "camera") else control.camera.intrinsics_4
+        made = jax.tree.map(jnp.asarray, frames(len(steps)))
+        rgb = made.rgb_THWC + 0.1 * 2 + 0.2 * 2 * dark
+        walled = state.map.classes_XYZ.at[4:6].set(3)
+        after = dataclasses.replace(state.map, classes_XYZ=walled)
+        return WorldState(state.frame, after), dataclasses.replace(made, rgb_THWC=rgb)
+
+    monkeypatch.setattr(worlds, "start", start)
+    monkeypatch.setattr(worlds, "imagine", imagine)
+    walk = horizon.RecordedWalk(
+        "w", frames(2), np.zeros((5, 3), np.float32), np.zeros((5, 16, 16, 3), np.uint8), None,
+        None, None, None,
+    )  # fmt: skip
+    found = voxel_scores.long_walks(CONFIG, {}, [walk, walk], [[way], [way, way]])
+    assert found.video.shape == (2, 5, 16, 16, 3)
+    before, after = found.seen
+    np.testing.assert_allclose([before, after], [20, -20 * np.log10(0.3)], atol=1e-3)
+    assert found.doorways == (3, 0)
+
+
+def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
+    config = CONFIG.with_model(empty_prior=2.0, guess_logit=1.0, shown_logit=2.0)
+    rows = {name: voxel_scores.variant(config, name).model for name in voxel_scores.MECHANISMS}
+    assert rows["as trained"] == config.model
+    assert rows["persistence_logit"].kept_logits == (0, 0, 0)
+    assert rows["empty_prior"].empty_prior == 0
+    assert rows["observation_logit"].observation_logit == 0
+    hold = config.model.persistence_logit
+    assert rows["guesses"].kept_logits == (hold, hold, hold)
+
+
+FACTS = {
+    "unseen": {"iou": 0.3, "prior": 0.12, "places": 24.0, "houses": 16.0},
+    "known": {"psnr": 22.5, "frames": 32},
+    "long": {"data": "d", "walks": 2, "frames": 600, "ends": [200, 400, 600], "beside": ["small"]},
+    "rows": {
+        "as trained": {
+            "iou": 0.3, "psnr": [15.0, 14.5, 14.25], "seen": [20.0, 19.75], "lost": 0.25,
+            "doorways": [6, 5], "fvd": 512.0,
+        },
+        "empty_prior": {
+            "iou": 0.2, "psnr": [14.0, 13.5, 13.25], "seen": [20.0, 18.0], "lost": 2.0,
+            "doorways": [6, 3], "fvd": 900.0,
+        },
+        "small": {"psnr": [13.0, 13.0, 13.0], "fvd": 800.0},
+    },
+}  # fmt: skip
+
+
+def test_the_terminal_shows_each_score_and_a_row_for_each_mechanism():
+    said = "\n".join(labels.format_voxels({"voxels": FACTS}))
+    for wanted in (
+        "0.300",
+        "0.120 (2.50 times)",
+        "22.50 dB",
+        "+0.25 dB",
+        "of 6 doorways seen open 5",
+        "as trained 512; small 800",
+    ):
+        assert wanted in said, wanted
+    table = labels.voxel_table(FACTS).text()
+    assert len(table) == 4
+    assert "empty_prior 0" in table[2]
+    assert "3 of 6" in table[2]
+    assert "–" in table[3]
+    short = FACTS | {"long": None, "rows": {"as trained": {"iou": 0.3}}}
+    assert "Long walks are not measured" in labels.format_voxels({"voxels": short})[-1]
+    assert len(labels.voxel_table(short).text()) == 2
+    assert labels.format_voxels({"voxels": None}) == []
+
+
+def test_long_walks_without_data_are_refused(tmp_path):
+    chosen = dataclasses.replace(CONFIG.evaluate, long=str(tmp_path))
+    with pytest.raises(UserError, match=r"evaluate\.long is .* does not exist"):
+        voxel_report.settings_of(dataclasses.replace(CONFIG, evaluate=chosen))
+    assert voxel_report.settings_of(CONFIG)["frames"] == 0
+
+
+def test_an_edit_is_made_in_another_room_and_seen_later(episode):
+    house = voxel_scores.house_of(episode.scene)
+    assert house is not None
+    kinds = {kind: list(voxel_edits._places(house, kind, 0.0, 0.25)) for kind in voxel_edits.KINDS}
+    assert len(kinds["door"]) == len(house["doorways"])
+    assert len(kinds["wall"]) >= 3 * len(house["rooms"])
+    for kind, found in kinds.items():
+        for place in found:
+            assert (place.box_23[1] > place.box_23[0]).all(), kind
+            assert (place.move is not None) == (kind == "wall")
+    boxes = object_boxes(int(house["seed"]))
+    assert any(kind_of(name) in FURNITURE for name in boxes)
+    assert all((box[1] >= box[0]).all() for box in boxes.values())
+    plans = [voxel_edits.plan(MASKED, episode, kind) for kind in voxel_edits.KINDS]
+    for plan in plans:
+        if plan is not None:
+            assert 0 <= plan.start < plan.end < episode.length
+
+
+def test_an_edit_changes_the_box_alone():
+    memory = MASKED.memory
+    grid = memory.empty(MASKED, jnp.zeros(3))
+    low = np.asarray(grid.low_3)
+    box = np.stack([low + 1, low + 2])
+    grid = class_grid.place(memory, grid, box.astype(np.float32), 3)
+    state = WorldState(None, grid)  # type: ignore[arg-type]
+    move = np.eye(4)
+    move[0, 3] = 1.0
+    moved = voxel_edits.apply(MASKED, state, voxel_edits.Plan("x", 0, 1, box, move))
+    gone = voxel_edits.apply(MASKED, state, voxel_edits.Plan("x", 0, 1, box))
+    assert (np.asarray(moved.map.classes_XYZ) == 3).sum() == 8
+    assert (np.asarray(moved.map.classes_XYZ)[4:6, 2:4, 2:4] == 3).all()
+    assert not (np.asarray(gone.map.classes_XYZ) == 3).any()
+    assert (np.asarray(class_grid.observed(gone.map)) == 1).sum() == 8
