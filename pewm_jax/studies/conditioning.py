@@ -25,6 +25,7 @@ from pewm_jax.eval import steering
 from pewm_jax.eval.metrics.selection import select_lpips, select_scs
 from pewm_jax.io import atomic, weights
 from pewm_jax.io.store import TABLE, ResultCache, file_hash, inputs_hash, require_same_inputs
+from pewm_jax.report.labels import PUBLISHED_FRAMES
 from pewm_jax.report.table import Cell, Table, row, with_interval
 from pewm_jax.studies import step_times
 from pewm_jax.train import loop
@@ -238,7 +239,7 @@ def table_of(found: Mapping[str, Mapping[int, Any]], plan: Mapping[str, Any]) ->
     some = next(iter(firsts.values()))
     known = [name for name in steering.SCORES if name in some["scores"]]
     frames = len(some["per_frame"]["true"]["mean"])
-    at = [t for t in steering.AT if t <= frames] or [frames]
+    at = [t for t in PUBLISHED_FRAMES if t <= frames] or [frames]
     heads = ["", "steps", "PSNR, dB", "PSNR, true − other"]
     for name in known:
         title = some["scores"][name]["name"]
