@@ -88,9 +88,13 @@ class JointsPanel:
     def take(self, name: str) -> None:
         """Request one of ``POSTURES``, and set the sliders to it."""
         assert self._body is not None
-        for (_, slider), value in zip(self.sliders, posture(self._body, name), strict=True):
-            slider.value = round(float(value), 2)
+        self.set(posture(self._body, name))
         self._send()
+
+    def set(self, joints: np.ndarray) -> None:
+        """Set the sliders to the values (A − 2,) of the joints; nothing is requested."""
+        for (_, slider), value in zip(self.sliders, joints, strict=True):
+            slider.value = round(float(value), 2)
 
     def _send(self) -> None:
         self._put(session.Pose(tuple(float(slider.value) for _, slider in self.sliders)))

@@ -287,6 +287,9 @@ class Page:
         if shown.engine is not None:
             self._editing.visible = shown.engine.editable
             self._joints.show(shown.engine.body)
+            now = shown.session
+            if now is not None and now.wished_A is not None and not now.steps:
+                self._joints.set(now.wished_A[:-2])  # another drive, or an opened world
             self._steps.visible = count != "0"
         if count not in ("0", self._steps.value):
             self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))

@@ -10,9 +10,11 @@ import pytest
 
 from pewm_jax import presets
 from pewm_jax.bodies.humanoid import HUMANOID
+from pewm_jax.cli import play
+from pewm_jax.cli.play import Settings
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import ClipConfig, UserError
+from pewm_jax.config import ClipConfig, UserError, serialize
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.make_episode import CollectConfig
@@ -181,6 +183,9 @@ def test_the_page_has_a_slider_for_every_joint_and_postures(tmp_path):
         wished = joints.posture(HUMANOID, "raise")
         np.testing.assert_allclose(one.driver._session.state_A[:-2], wished, atol=0.01)
         assert panel.sliders[6][1].value == round(wished[6], 2)
+        one.driver.put(session.Begin(Start(house=2)))
+        assert one.driver.wait(LONG)
+        assert panel.sliders[6][1].value == round(HUMANOID.rest[6], 2)
     finally:
         one.close()
 
@@ -223,6 +228,14 @@ def test_a_drive_begins_in_an_episode_of_the_body_and_no_other(data):
     camera = session.begin(a_puppet(), places.open_place(other, SIZE, SIZE))
     with pytest.raises(UserError, match="no joints"):
         session.apply(a_puppet(), camera, session.Pose((0.0,)))
+
+
+def test_a_start_without_the_body_is_refused_before_the_page_opens(data, tmp_path):
+    serialize.save(config(), tmp_path / "config.json")
+    given = Settings(model=str(tmp_path), episode=str(data / "camera/train"))
+    with pytest.raises(UserError, match="not recorded by the body humanoid"):
+        play._require_usable(given)
+    play._require_usable(dataclasses.replace(given, episode=str(data / "body/train")))
 
 
 def test_what_steers_decides_who_can_drive():
