@@ -16,7 +16,7 @@ import numpy as np
 
 from pewm_jax.errors import UserError, require
 
-FORWARD, TURN = "linear_velocity", "angular_velocity"
+FORWARD, TURN = WALKING = "linear_velocity", "angular_velocity"
 """The degrees of freedom of walking: metres forward and radians counter-clockwise since the frame
 before. They are the last two of every body."""
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
