@@ -37,7 +37,7 @@ def posture(body: Body, name: str) -> np.ndarray:
 
 
 class JointsPanel:
-    """The sliders of a body; empty until ``show`` is told which body the model has."""
+    """The sliders of a body; empty until ``show`` is called with the name of the model's body."""
 
     def __init__(self, server: viser.ViserServer, put: Callable[[Request], None]):
         """Prepare the panel of a page; ``put`` receives the requests."""
