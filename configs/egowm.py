@@ -14,8 +14,8 @@ NOISE = EDMConfig(sigma_data=1.0, log_mean=-0.4, log_std=1.2, sigma_max=20.0, sa
 def config() -> Config:
     """Return the settings of ``egowm``.
 
-    The backbone is the demo's. The codec is ``codec-2``: the LPIPS of what ``codec`` reconstructs
-    is already that of copying an observed frame for some steps. The observed frame conditions every
+    The backbone is the demo's. The codec is ``codec-2``: what ``codec`` reconstructs has a higher
+    LPIPS than the frame that was observed four steps before. The observed frame conditions every
     latent frame: the world has no memory, and what is not in the present frame has to be imagined.
     Steps and turns are small, so that what is observed stays in view for a while. Its data:
     ``pewm-jax data collect data/ego --train 2000 --validation 32 --test 48 --frames 72 --step_m
