@@ -206,7 +206,7 @@ def _what(facts: CardFacts) -> str:
         )
     if can.memory_parameters and can.memory_parameters not in facts.params:
         memory = "no memory (only its first stage is trained)"
-    made_of = [f"image features `{parts.encoder}`"] * bool(parts.encoder)
+    made_of = [f"image features `{parts.encoder}`"] * bool(parts.encoder and can.memory)
     made_of += [f"codec `{parts.codec}`"] * bool(parts.codec)
     made_of = ", ".join(["", " and ".join(made_of)]) if made_of else ""
     size = f"{clip.frames} frames of {clip.width} × {clip.height} pixels"
@@ -277,10 +277,12 @@ def _data(facts: CardFacts) -> str:
         made = manifest.settings.get("made_by")
         how = f", made by `{made}`" if made else ""
         size = f"split `{TRAINED_ON}`: {manifest.records} episodes, {manifest.frames} frames{how}"
+    context = ""
+    if config.model.batch_spec.context:
+        context = f", with up to {config.data.context} earlier frames as context"
     return (
         f"## Data\n\n`{name}`, {size}. Clips take every {config.data.stride_min} to "
-        f"{config.data.stride_max} actions a frame, with up to {config.data.context} earlier "
-        "frames as context."
+        f"{config.data.stride_max} actions a frame{context}."
     )
 
 
