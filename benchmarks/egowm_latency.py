@@ -42,7 +42,7 @@ def models(preset: str, chunk: int, steps: int) -> dict[str, EgoWM]:
 
 def main() -> None:
     """Time both and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--frames", type=int, default=64, help="frames to imagine")
     parser.add_argument("--chunk", type=int, default=8, help="frames of a chunk")
     parser.add_argument("--steps", type=int, default=8, help="evaluations of the network")

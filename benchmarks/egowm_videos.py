@@ -34,7 +34,7 @@ ARMS = ("left_", "right_")
 
 def main() -> None:
     """Imagine clips and write them."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("run", help="folder of a finished training, or shipped weights")
     parser.add_argument("--out", type=Path, required=True, help="folder of the files")
     parser.add_argument("--data", help="data folder; by default the run's")
