@@ -23,7 +23,7 @@ from pewm_jax import presets, worlds
 from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds.egowm.world import EgoWM
 
-PRESET = "egowm_tiny"
+PRESET = "egowm"
 
 
 def models(preset: str, chunk: int, steps: int) -> dict[str, EgoWM]:
@@ -42,10 +42,10 @@ def models(preset: str, chunk: int, steps: int) -> dict[str, EgoWM]:
 
 def main() -> None:
     """Time both and print."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--frames", type=int, default=64, help="frames to imagine")
     parser.add_argument("--chunk", type=int, default=8, help="frames of a chunk")
-    parser.add_argument("--steps", type=int, default=6, help="evaluations of the network")
+    parser.add_argument("--steps", type=int, default=8, help="evaluations of the network")
     parser.add_argument("--repeats", type=int, default=5, help="timed runs of each")
     parser.add_argument("--preset", default=PRESET, help="whose network it is")
     parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")

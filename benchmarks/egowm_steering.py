@@ -3,22 +3,21 @@
 `python benchmarks/egowm_steering.py runs/egowm` prints the means with 95 % intervals over the
 houses of the run's held-out split, and how much better the true actions are: PSNR, LPIPS, SCS with
 exact masks of the true clips, and for an agent with a body the IoU of its arms with the truth. The
-last lines compare them: LPIPS with copying the observed frame at frames 4, 8 and 16, and the true
-actions with another clip's.
+last lines compare them: LPIPS with copying the observed frame at frames 4, 8 and 16, SCS and the
+arms with another clip's actions.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pewm_jax
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.eval import steering
 from pewm_jax.eval.metrics.selection import select_lpips, select_scs
+from pewm_jax.report.labels import compare_steering
 
 
 def main() -> None:
@@ -54,24 +53,7 @@ def main() -> None:
     found = steering.measure(
         config, params, episodes, given.clips, seed=given.seed, measures=measures
     )
-    print("\n".join([*found.lines(), *compared(found.facts())]))
-
-
-def compared(facts: Mapping[str, Any]) -> list[str]:
-    """Return lines that compare true actions with copying and with another clip's."""
-    lines = []
-    scores = facts["scores"]
-    if "lpips" in scores:
-        true, copy = (scores["lpips"]["per_frame"][kind]["mean"] for kind in ("true", "copy"))
-        at = [t for t in steering.AT if t <= len(true)]
-        said = ", ".join(f"frame {t}: {100 * (true[t - 1] / copy[t - 1] - 1):+.1f} %" for t in at)
-        lines.append(f"LPIPS against copying: {said}")
-    lines.append(f"PSNR, true - another clip's: {facts['all']['true - shuffled']['mean']:+.2f} dB")
-    for name in ("scs", "arms"):
-        if name in scores:
-            true, other = (scores[name]["all"][kind]["mean"] for kind in ("true", "shuffled"))
-            lines.append(f"{scores[name]['name']}, true / another clip's: {true / other:.2f}")
-    return lines
+    print("\n".join([*found.lines(), *compare_steering(found.facts())]))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ import numpy as np
 
 from pewm_jax.errors import UserError, require
 
-FORWARD, TURN = "linear_velocity", "angular_velocity"
+FORWARD, TURN = WALKING = "linear_velocity", "angular_velocity"
 """The degrees of freedom of walking: metres forward and radians counter-clockwise since the frame
 before. They are the last two of every body."""
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -200,6 +200,31 @@ class Body:
         pose = self.poses(planar_T3, state_TA, scale)[:, place] @ OPTICAL
         pose[:, 2, 3] += floor_z
         return pose.astype(np.float32)
+
+    def planar_of(
+        self, world_from_camera: np.ndarray, state_A: np.ndarray, scale: float = 1.0
+    ) -> np.ndarray:
+        """Return x, y, yaw of the body whose camera has a (4, 4) pose in a state."""
+        own = self.world_from_camera(np.zeros((1, 3)), np.asarray(state_A)[None], scale)[0]
+        base = np.asarray(world_from_camera, np.float64) @ np.linalg.inv(own.astype(np.float64))
+        return np.array([base[0, 3], base[1, 3], np.arctan2(base[1, 0], base[0, 0])])
+
+    def toward(self, state_A: np.ndarray, wished_A: np.ndarray) -> np.ndarray:
+        """Return the state one frame later on the way to another, standing still.
+
+        No joint moves by more than its fastest change.
+        """
+        wished = np.clip(wished_A, self.low, self.high)
+        step = np.clip(wished - state_A, -self.fastest, self.fastest)
+        after = np.asarray(state_A, np.float64) + step
+        after[-2:] = 0
+        return after
+
+    def frames_to(self, state_A: np.ndarray, wished_A: np.ndarray) -> int:
+        """Return the number of frames until ``toward`` reaches a state."""
+        wished = np.clip(wished_A, self.low, self.high)
+        away = np.abs(wished - state_A)[:-2] / self.fastest[:-2]
+        return int(np.ceil(away.max(initial=0.0) - 1e-6))
 
     @functools.cached_property
     def eye_m(self) -> float:

@@ -120,6 +120,11 @@ COMMANDS = {
         f"{CLI}.studies:PracticeSettings",
         f"{CLI}.studies:practice",
     ),
+    "conditioning": Command(
+        "train and score ways of giving actions to a network: EgoWM's ablation",
+        f"{CLI}.studies:ConditioningSettings",
+        f"{CLI}.studies:conditioning",
+    ),
     "memory cache": Command(
         "compute the image encoder's features of every frame once",
         "pewm_jax.memory.feature_cache:CacheConfig",

@@ -7,7 +7,7 @@ import functools
 import os
 import threading
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -22,8 +22,8 @@ class Settings(Start, Serve):
     """Drive through a world that a model imagines, in the browser.
 
     W, A, S, D or the arrow keys drive; the page shows the map in 3D, with boxes to erase and move.
-    The drive starts in a generated house, unless a mesh, an episode or a recording is given. Ctrl-C
-    ends it.
+    A model that is steered by the joints of a body has a slider for each of them. The drive starts
+    in a generated house, unless a mesh, an episode or a recording is given. Ctrl-C ends it.
     """
 
     model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")] = dataclasses.field(
@@ -76,15 +76,17 @@ def _require_usable(settings: Settings) -> None:
     Weights are memory-mapped and not read.
     """
     from pewm_jax import config as configuration
+    from pewm_jax.config import World
     from pewm_jax.play import places
     from pewm_jax.worlds.rollouts import load_finished
 
     run, worlds = shipped.find(settings.model), settings.worlds
-    clip = configuration.load(run / "config.json").model.clip
+    model: Any = configuration.load(run / "config.json").model
     if (run / "weights.safetensors").is_file():
         load_finished(settings.model, lazily=True)
     if settings.scene or settings.episode or settings.recording:
-        places.open_place(settings, clip.height, clip.width)
+        body = model.capabilities.body if isinstance(model, World) else ""
+        places.open_place(settings, model.clip.height, model.clip.width, body=body)
     if worlds is not None:
         there = next(path for path in (worlds, *worlds.absolute().parents) if path.exists())
         if not there.is_dir() or not os.access(there, os.W_OK):

@@ -1,4 +1,4 @@
-"""Run the studies: ``pewm-jax table1``, ``table2`` and ``practice``."""
+"""Run the studies: ``pewm-jax table1``, ``table2``, ``practice`` and ``conditioning``."""
 
 from __future__ import annotations
 
@@ -232,3 +232,61 @@ def practice(settings: PracticeSettings) -> None:
     runtime.cache_compilation(settings.out)
     page = study.run(settings.model, settings.policy, settings.out, errand)
     print(f"table: {page}")
+
+
+@dataclasses.dataclass(frozen=True)
+class ConditioningSettings:
+    """Train and score every way of giving actions to a network: EgoWM's ablation.
+
+    The actions are added to the time embedding (the paper), attended to as tokens, or joined to the
+    input channels; one row is trained without actions. All train for equal time and are scored on
+    the same held-out clips: PSNR, LPIPS, SCS with exact masks of the true clips, IoU of the arms of
+    an agent with a body. If interrupted, run it again: it resumes.
+    """
+
+    out: Path = Path("runs/conditioning")
+    """Folder of the results."""
+    preset: str = "egowm"
+    """Settings that all rows share: `egowm`, or `egowm_humanoid` with 25 degrees of freedom."""
+    data: Path | None = None
+    """Folder of the data set; by default the preset's."""
+    minutes: float = 30.0
+    """Minutes of training steps of each row; processor time on a CPU."""
+    steps: int = 0
+    """Number of steps of each row instead: equal steps instead of equal time."""
+    seeds: tuple[int, ...] = (0,)
+    """Training seeds."""
+    rows: tuple[str, ...] = ()
+    """Only these rows: timestep, attention, channels, none."""
+    clips: int = 96
+    """Number of held-out clips."""
+    prepared: int | None = None
+    """Clips that are prepared once (`data.prepared`); by default the preset's. They stay in main
+    memory."""
+
+
+def conditioning(settings: ConditioningSettings) -> None:
+    """Write the table and print its path."""
+    config = presets.load(parser.choose(settings.preset, presets.names(), "preset"))
+    changes: dict[str, Any] = {}
+    if settings.data is not None:
+        changes |= {"path": str(settings.data), "prepared_path": ""}
+    if settings.prepared is not None:
+        changes |= {"prepared": settings.prepared, "prepared_path": ""}
+        changes |= {"refresh": config.data.refresh if settings.prepared else 0}
+    config = dataclasses.replace(config, data=dataclasses.replace(config.data, **changes))
+    runtime.keep_large()
+    # Imported lazily: help and errors are fast.
+    from pewm_jax.studies import conditioning as study
+
+    runtime.cache_compilation(settings.out)
+    asked = study.Study(
+        config,
+        settings.out,
+        minutes=settings.minutes,
+        steps=settings.steps,
+        seeds=settings.seeds,
+        rows=settings.rows or study.ROWS,
+        clips=settings.clips,
+    )
+    print(f"table: {study.run(asked)}")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
 from pewm_jax.config.world import (
+    PLANAR,
     ActionConfig,
     ArraySpec,
     BatchSpec,
@@ -97,6 +98,8 @@ class AssembledModel(World):
             memory=memory.REMEMBERS,
             memory_parameters="memory" if memory.READ_BY_BLOCKS else "",
             depth=self.clip.depth,
+            actions=self.control.actions in (0, PLANAR),
+            body=self.control.body,
             cameras=not self.control.actions,
             points=memory.REMEMBERS,
             edits=memory.EDITABLE and type(self).erase is not World.erase,

@@ -250,7 +250,8 @@ class Conditioner(Settings):
         MODULATES: whether it adds to the time embedding of each latent frame.
         SHARDING: rules over ``control/…`` paths.
         actions: A, the numbers of an action that it needs; 0 where cameras are enough.
-        state: numbers of the agent's state at the first frame that it needs; 0 for none.
+        state: numbers of the agent's state at the last observed frame that it needs; 0 for none.
+        body: the body whose degrees of freedom the actions are; "" for none that is known.
         rate: factor of the learning rate of its parameters.
     """
 
@@ -259,12 +260,17 @@ class Conditioner(Settings):
     MODULATES: ClassVar[bool] = False
     actions: Any = 0
     state: Any = 0
+    body: Any = ""
     rate: Any = 1.0
 
     def channels(self, model: Any) -> int:
         """Return the channels, at the latent rate, that it adds to the denoiser's input."""
         del model
         return 0
+
+    def still(self, action_A: Array) -> Array:
+        """Return the action (..., A) of an agent that stands still after another action: zeros."""
+        return 0 * action_A
 
     def init(self, model: Any, key: Array) -> Params:
         """Return random parameters."""

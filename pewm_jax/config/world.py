@@ -137,6 +137,7 @@ class Capabilities:
             without them was trained without a memory. Empty if the memory needs none.
         depth: whether imagined frames have depth.
         actions: whether planar actions (dx, dy, dyaw) steer it.
+        body: the body (``bodies``) whose degrees of freedom steer it; "" for none.
         cameras: whether cameras without actions steer it.
         points: whether ``memory_points`` lists the memory as coloured points.
         edits: whether ``erase`` and ``move`` change the content of a box of the memory.
@@ -153,6 +154,7 @@ class Capabilities:
     memory_parameters: str = ""
     depth: bool = True
     actions: bool = True
+    body: str = ""
     cameras: bool = True
     points: bool = False
     edits: bool = False

@@ -3,8 +3,8 @@
 Wherever the noise level modulates a network, frame i gets proj(e_t + e_a[i]), or, with the agent's
 state, proj(e_t + e_s + e_a[i]) (Eqs. 5 and 6): no layer of the network changes. e_a[i] depends on
 the actions that lead to the frames of latent frame i, and with convolutions on earlier actions,
-never on later ones. Observed frames have none. The last layers are zero at first, so that a model
-trained without actions is unchanged.
+never on later ones. Observed frames have none: actions before the last one count as 0. The last
+layers are zero at first, so that a model trained without actions is unchanged.
 
 Two other ways are there to compare with: further tokens that the network attends to, and further
 input channels (``inject``). They use the same embedding, followed by one more layer.
@@ -25,6 +25,7 @@ import numpy as np
 from jax.sharding import PartitionSpec as P
 
 from pewm_jax.bodies.humanoid import BODIES
+from pewm_jax.bodies.kinematics import WALKING
 from pewm_jax.config.parts import Conditioner, Rules
 from pewm_jax.controls import camera
 from pewm_jax.errors import UserError, require, require_positive
@@ -71,14 +72,14 @@ class ModulationConfig(Conditioner):
     features: int = 32
     """Cosines and sines of each number, with `sinusoid`; even."""
     state: int = 0  # type: ignore[assignment]
-    """Numbers of the agent's state at the first frame, which is added to every frame (Eq. 6): as
-    many as those of an action, which is then the next state; 0 for none."""
+    """Numbers of the agent's state at the last observed frame, which is added to every frame (Eq.
+    6): as many as those of an action, which is then the next state; 0 for none."""
     inject: Literal["timestep", "attention", "channels"] = "timestep"
     """How the embeddings reach the network. `timestep`: added to the time embedding of each latent
     frame, which modulates the layers (the paper). `attention`: as further tokens after those of the
     text, one per latent frame, where the backbone attends to any number of tokens. `channels`:
     repeated over height and width, as further input channels."""
-    body: Literal["", "humanoid"] = ""
+    body: Literal["", "humanoid"] = ""  # type: ignore[assignment]
     """The body whose degrees of freedom the actions are (`data collect --body`): the viewer then
     has a slider for each of them. Empty: the actions are of no known body."""
     rays: bool = False
@@ -146,6 +147,17 @@ class ModulationConfig(Conditioner):
             "freedom: use that number.",
         )
 
+    def still(self, action_A: Array) -> Array:
+        """Return the action (..., A) of an agent that stands still after another action.
+
+        Where actions are states, the joints stay, and a known body neither walks nor turns; other
+        actions are zero.
+        """
+        if not (self.state or self.body):
+            return super().still(action_A)
+        walking = np.arange(self.actions) >= self.actions - len(WALKING) * bool(self.body)
+        return jnp.where(walking, 0, action_A)
+
     def init(self, model: Any, key: Array) -> Params:
         """Return random parameters; the last layers are zero."""
         last = {"linear_2" if self.projection == "sinusoid" else "conv_2", "state_2"}
@@ -170,8 +182,11 @@ class ModulationConfig(Conditioner):
                 "this model's control (actions) is steered by actions, and got cameras alone: give "
                 "actions, or a Control with both."
             )
-        led = jnp.pad(self.embed(model, params, control.actions_TA), ((0, 0), (1, 0), (0, 0)))
-        held = model.codec.frames(observed.depth_THW.shape[1])
+        observed_frames = observed.depth_THW.shape[1]
+        later = np.arange(control.actions_TA.shape[1]) >= observed_frames - 1
+        actions = jnp.where(later[:, None], control.actions_TA, 0)
+        led = jnp.pad(self.embed(model, params, actions), ((0, 0), (1, 0), (0, 0)))
+        held = model.codec.frames(observed_frames)
         led = jnp.where((np.arange(led.shape[1]) >= held)[:, None], led, 0)
         if self.state:
             if control.state_A is None:

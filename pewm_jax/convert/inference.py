@@ -30,9 +30,11 @@ from pewm_jax import registry as kinds
 from pewm_jax.config import Config, UserError, World
 from pewm_jax.convert import pipeline
 from pewm_jax.data.dataset import read_manifest
+from pewm_jax.eval.clips import steered_by_record
 from pewm_jax.eval.evaluate import METRICS
 from pewm_jax.io import sources, tensor_files, tree, weights
 from pewm_jax.io.store import file_hash
+from pewm_jax.report import labels
 from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
 from pewm_jax.train import runs
 from pewm_jax.types import Params
@@ -181,7 +183,8 @@ class CardFacts:
 def write_card(facts: CardFacts) -> str:
     """Return the card in Markdown."""
     parts = [f"# {facts.name}", _what(facts), _use(facts), _data(facts), _training(facts)]
-    return "\n\n".join([*parts, _scores(facts.metrics, facts.dtype), _licence(facts)]) + "\n"
+    parts += [_scores(facts.metrics, facts.dtype), *_steering(facts.metrics), _licence(facts)]
+    return "\n\n".join(parts) + "\n"
 
 
 def _count(params: Params) -> int:
@@ -203,13 +206,16 @@ def _what(facts: CardFacts) -> str:
         )
     if can.memory_parameters and can.memory_parameters not in facts.params:
         memory = "no memory (only its first stage is trained)"
-    made_of = [f"image features `{parts.encoder}`"] * bool(parts.encoder)
+    made_of = [f"image features `{parts.encoder}`"] * bool(parts.encoder and can.memory)
     made_of += [f"codec `{parts.codec}`"] * bool(parts.codec)
     made_of = ", ".join(["", " and ".join(made_of)]) if made_of else ""
     size = f"{clip.frames} frames of {clip.width} × {clip.height} pixels"
     seen = "colour and depth" if can.depth else "in colour"
+    given = "A persistent embodied world model: given posed RGB-D frames"
+    if not can.memory:
+        given = f"An embodied world model: given {'an RGB-D' if can.depth else 'a'} frame"
     return (
-        "A persistent embodied world model: given posed RGB-D frames and an agent's actions, it "
+        f"{given} and an agent's actions, it "
         f"imagines what the agent will see, {seen}, in clips of {size}, with {memory}{made_of}."
         f"\n\n{table}\n\n"
         "Weights are the moving average of the trained parameters and the unchanged base weights "
@@ -224,7 +230,20 @@ def _use(facts: CardFacts) -> str:
     if not isinstance(model, World):
         return f"## Use\n\n{model.CARD[1].format(name=facts.name)}"
     clip, actions = facts.config.model.clip, facts.config.model.actions
-    length = clip.frames - 1
+    length, numbers = clip.frames - 1, model.batch_spec.actions
+    steps = f"[0] * {length}"
+    how = (
+        f"Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}°, or "
+        f"floats\n(dx, dy, dyaw); {length} a clip."
+    )
+    if steered_by_record(model):
+        steps = "control"
+        what = f"(n, {numbers}) actions"
+        if model.capabilities.body:
+            what += f" of the body `{model.capabilities.body}`"
+        if "state_A" in model.batch_spec.names:
+            what += f", ({numbers},) state of the agent at the present frame"
+        how = f"`control` is a `pewm_jax.Control`: (n,) cameras, {what}; {length} frames a clip."
     return f"""## Use
 
 ```python
@@ -233,11 +252,10 @@ import pewm_jax
 
 config, params = pewm_jax.load("{facts.name}")
 state = pewm_jax.start(config, params, frames)  # pewm_jax.Frames, {clip.height} × {clip.width}
-state, imagined = pewm_jax.rollout(config, params, state, [0] * {length}, jax.random.key(0))
+state, imagined = pewm_jax.rollout(config, params, state, {steps}, jax.random.key(0))
 ```
 
-Actions: 0 forward {actions.step_m:g} m, 1 left and 2 right {actions.turn_deg:g}°, or floats
-(dx, dy, dyaw); {length} a clip.{_sampler(model)}"""
+{how}{_sampler(model)}"""
 
 
 def _sampler(model: World) -> str:
@@ -259,10 +277,12 @@ def _data(facts: CardFacts) -> str:
         made = manifest.settings.get("made_by")
         how = f", made by `{made}`" if made else ""
         size = f"split `{TRAINED_ON}`: {manifest.records} episodes, {manifest.frames} frames{how}"
+    context = ""
+    if config.model.batch_spec.context:
+        context = f", with up to {config.data.context} earlier frames as context"
     return (
         f"## Data\n\n`{name}`, {size}. Clips take every {config.data.stride_min} to "
-        f"{config.data.stride_max} actions a frame, with up to {config.data.context} earlier "
-        "frames as context."
+        f"{config.data.stride_max} actions a frame{context}."
     )
 
 
@@ -324,6 +344,18 @@ def _scores(metrics: Mapping[str, Any] | None, dtype: str | None) -> str:
         f"protocol {protocol['fingerprint'][:12]}."
     )
     return head + "\n".join(rows) + said
+
+
+def _steering(metrics: Mapping[str, Any] | None) -> list[str]:
+    """Return what a report says about the actions; empty if it was not measured."""
+    if metrics is None or not metrics.get("steering"):
+        return []
+    found = metrics["steering"]
+    clips = f"{found['clips']} clips, {100 * found['forward']:.0f} % of whose steps go forward"
+    return [
+        f"With other actions ({clips}):",
+        "\n".join(f"- {x}" for x in labels.format_steering(metrics)),
+    ]
 
 
 def _licence(facts: CardFacts) -> str:

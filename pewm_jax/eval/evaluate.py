@@ -265,7 +265,7 @@ def _measure(
     covered = steered = about_steering = None
     if methods.remembers and config.model.capabilities.coverage:
         covered = score_coverage(config, episodes, methods.model, cache, log, clips)
-    if not methods.model.cameras:
+    if steered_by_record(config.model) or not methods.model.cameras:
         arms = bool(config.model.batch_spec.actions) and steering.shows_arms(episodes)
         measures = steering.Measures(metrics.lpips, metrics.structure, arms)
         steered, about_steering = steering.score(

@@ -35,6 +35,7 @@ from pewm_jax.eval.scoring import Tracked, tracked_of
 from pewm_jax.eval.walks import Walks, choose_walks
 from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import ResultCache, map_resumable
+from pewm_jax.report.labels import PUBLISHED_FRAMES
 from pewm_jax.types import Array, Control, Frames, Params
 
 TRUE, SHUFFLED, NONE, COPY, TRUTH = "true", "shuffled", "none", "copy", "truth"
@@ -43,8 +44,6 @@ SMALLER = ("lpips",)
 """Scores of which smaller values are better."""
 SCORES = ("lpips", "scs", "arms")
 """The scores beside PSNR, in the order of reports."""
-AT = (4, 8, 16)
-"""Imagined frames at which the paper's tables have scores."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +138,7 @@ class Steered:
         return statistics.entries({**values, **gains}, self.walks.houses)
 
     def lines(self) -> list[str]:
-        """Return the tables as text: whole clips, and the frames of ``AT``."""
+        """Return the tables as text: whole clips, and the frames of ``PUBLISHED_FRAMES``."""
         out = [self.walks.about, "PSNR in dB, means over houses"]
         out += _lines(self.table(), self.per_frame(), 2)
         for found in self.facts()["scores"].values():
@@ -155,11 +154,11 @@ def _lines(whole: Mapping[str, Any], frames: Mapping[str, Any], digits: int) -> 
         low, high, mean = found["low"], found["high"], found["mean"]
         span = "" if low is None else f"  [{low:.{digits}f}, {high:.{digits}f}]"
         each = frames[name]["mean"]
-        known = [(t, each[t - 1]) for t in AT if t <= len(each) and each[t - 1] is not None]
-        at = "".join(f"  frame {t}: {value:.{digits}f}" for t, value in known)
-        out.append(
-            f"  {name:<16} {'–' if mean is None else f'{mean:{digits + 4}.{digits}f}'}{span}{at}"
-        )
+        at = [t for t in PUBLISHED_FRAMES if t <= len(each)]
+        known = [(t, each[t - 1]) for t in at if each[t - 1] is not None]
+        shown = "".join(f"  frame {t}: {value:.{digits}f}" for t, value in known)
+        number = "–" if mean is None else f"{mean:{digits + 4}.{digits}f}"
+        out.append(f"  {name:<16} {number}{span}{shown}")
     return out
 
 

@@ -47,7 +47,8 @@ def pictures(engine: Engine, session: Session) -> Pictures:
     """Return the present frames of a drive."""
     camera = session.world.frame.camera
     here = Camera(np.asarray(camera.intrinsics_4), pose(session)[None])
-    real = places.truth(session.place, here, *engine.size)
+    posture = None if session.state_A is None else (session.planar_3, session.state_A)
+    real = places.truth(session.place, here, *engine.size, posture)
     blind = as_bytes(np.asarray(session.blind.frame.rgb_THWC[0])) if engine.has_memory else None
     return Pictures(
         as_bytes(np.asarray(session.world.frame.rgb_THWC[0])),

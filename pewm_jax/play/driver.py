@@ -28,6 +28,7 @@ from pewm_jax.play.session import (
     GoTo,
     Load,
     PageUpdate,
+    Pose,
     Record,
     Request,
     Sampler,
@@ -41,7 +42,7 @@ from pewm_jax.types import WorldState
 
 MOST_UNDO, MOST_WAITING, MOST_WAY = 4, 32, 64
 """Largest number of edits that can be undone, of queued requests, and of steps per drag."""
-NEWEST = ((Drive, GoTo), (Walls,), (Sampler,), (Begin,))
+NEWEST = ((Drive, GoTo, Pose), (Walls,), (Sampler,), (Begin,))
 """Groups of requests of which only the newest is kept in the queue."""
 PAUSE_S = 0.1
 """Seconds given to a browser on the same machine to draw before the next step is imagined ahead."""
@@ -186,7 +187,8 @@ class Driver:
             self._save_load_or_undo(engine, now, request)
         elif isinstance(request, GoTo):
             steps, target = engine.model.actions, np.asarray(request.planar, np.float64)
-            parts = places.way(now.planar_3, target, steps.step_m, steps.turn_deg)
+            way = places.way if now.place.agent is None else places.forward_way
+            parts = way(now.planar_3, target, steps.step_m, steps.turn_deg)
             if len(parts) > MOST_WAY:
                 self._log(
                     f"That place is {len(parts)} steps away: driving the first {MOST_WAY} steps. "
@@ -194,6 +196,8 @@ class Driver:
                 )
             steps_3 = parts[:MOST_WAY].tolist()
             self._todo = collections.deque(Drive((x, y, turn)) for x, y, turn in steps_3)
+        elif isinstance(request, Pose):
+            self._move_joints(session.apply(engine, now, request))
         elif isinstance(request, Sampler):
             self._sample_in(engine.with_sampler_steps(request.steps), now)
         elif isinstance(request, Record):
@@ -201,17 +205,27 @@ class Driver:
         else:
             self._edit(engine, now, request, asked)
 
+    def _move_joints(self, now: Session) -> None:
+        """Make as many steps as the joints of the body need to reach the wished ones."""
+        assert now.place.agent is not None
+        assert now.state_A is not None
+        assert now.wished_A is not None
+        self._session = now
+        count = now.place.agent.body.frames_to(now.state_A, now.wished_A)
+        self._todo = collections.deque([Drive((0.0, 0.0, 0.0))] * min(count, MOST_WAY))
+
     def _save_load_or_undo(self, engine: Engine, now: Session, request: Save | Load | Undo) -> None:
         """Save a world, load one, or undo an edit."""
         if isinstance(request, Save):
-            path = saved.save(engine, now.world, self._folder, request.name)
+            path = saved.save(engine, now.world, self._folder, request.name, now.state_A)
             self._log(f"Saved this world as {request.name!r}.", link=path)
             return
         self._todo.clear()
         if isinstance(request, Load):
             world = saved.load(engine, now.world, self._folder, request.name)
+            state = saved.posture(self._folder, request.name)
             self._before.append(now)
-            self._set(session.resume(now, world, f"This is the world {request.name!r}."))
+            self._set(session.resume(now, world, f"This is the world {request.name!r}.", state))
             return
         if not self._before:
             raise UserError("There is nothing to undo.")
@@ -243,7 +257,8 @@ class Driver:
         engine = self._engine
         with self._busy("looking around"):
             places.require_shown(engine.model, start)
-            place = places.open_place(start, *engine.size, places.blocks_of(engine.model))
+            blocks = places.blocks_of(engine.model)
+            place = places.open_place(start, *engine.size, blocks, engine.body)
             begun = session.begin(engine, place, start.seed)
         self._end_film()
         self._before.clear()
@@ -258,7 +273,8 @@ class Driver:
         step = Drive((engine.model.actions.step_m, 0.0, 0.0))
         action, _, _ = session.wanted(now, step)
         made = session.ahead(engine, now, action)
-        due = dataclasses.replace(now, due=(action, session.key_of(now)))
+        due = (session.step_of(now, action), session.key_of(now))
+        due = dataclasses.replace(now, due=due)
         _ = np.asarray(session.catch_up(engine, due).blind.frame.rgb_THWC)
         if engine is self._engine:
             self._made[action.tobytes()] = made

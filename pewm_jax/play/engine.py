@@ -7,6 +7,7 @@ Every step is one action, imagined as its own clip and stored in the memory, as 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config, UserError, World
 from pewm_jax.errors import require
-from pewm_jax.types import Array, Frames, Params, WorldState
+from pewm_jax.types import Array, Control, Frames, Params, WorldState
 
 _points = jax.jit(worlds.memory_points, static_argnums=0)
 _erase = jax.jit(worlds.erase, static_argnums=0)
@@ -46,6 +47,11 @@ class Engine:
         return self.model.capabilities.memory
 
     @property
+    def body(self) -> str:
+        """Return the name of the body whose joints steer the model; "" for planar actions."""
+        return self.model.capabilities.body
+
+    @property
     def editable(self) -> bool:
         """Return whether boxes of the map can be erased and moved."""
         return self.model.capabilities.edits
@@ -70,14 +76,18 @@ class Engine:
         """Start a world; see ``worlds.start``."""
         return worlds.start(self.model, self.params, frames)
 
-    def imagine(self, world: WorldState, action_3: np.ndarray, key: Array) -> WorldState:
-        """Return the world after one action (dx, dy, dyaw), including the new frame."""
-        action = np.asarray(action_3, np.float32)[None]
-        return worlds.imagine(self.model, self.params, world, action, key)[0]
+    def imagine(self, world: WorldState, step: np.ndarray | Control, key: Array) -> WorldState:
+        """Return the world after one step, including the new frame.
 
-    def imagine_blind(self, world: WorldState, action_3: np.ndarray, key: Array) -> WorldState:
-        """Return the world after one action, without reading or updating the memory."""
-        action = np.asarray(action_3, np.float32)[None]
+        A step is an action (dx, dy, dyaw), or the control of one frame.
+        """
+        return worlds.imagine(self.model, self.params, world, _control(step), key)[0]
+
+    def imagine_blind(
+        self, world: WorldState, step: np.ndarray | Control, key: Array
+    ) -> WorldState:
+        """Return the world after one step, without reading or updating the memory."""
+        action = _control(step)
         return worlds.imagine(
             self.model, self.params, world, action, key, remember=False, memory=False
         )[0]
@@ -117,9 +127,16 @@ def open_engine(name: str, config: Config, params: Params) -> Engine:
         UserError: the model is not a world that can be driven.
     """
     world = worlds.require_world(config.model, f"the viewer of {name}")
-    if not world.capabilities.actions:
-        raise UserError(f"{name} has no planar actions (dx, dy, dyaw), which a drive needs.")
+    if not (world.capabilities.actions or world.capabilities.body):
+        raise UserError(
+            f"{name} has neither planar actions (dx, dy, dyaw) nor those of a known body "
+            "(control.body), which a drive needs."
+        )
     return Engine(name, config, jax.tree.map(jnp.asarray, params))
+
+
+def _control(step: np.ndarray | Control) -> Any:
+    return step if isinstance(step, Control) else np.asarray(step, np.float32)[None]
 
 
 def _require_box(box_23: np.ndarray) -> None:

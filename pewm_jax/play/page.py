@@ -21,6 +21,7 @@ import numpy as np
 from pewm_jax.config import ActionConfig
 from pewm_jax.play import board, picking, serving, session
 from pewm_jax.play.driver import Driver
+from pewm_jax.play.joints import JointsPanel
 from pewm_jax.play.map_view import MapView, eye_of
 from pewm_jax.play.serving import viser
 from pewm_jax.play.session import PageUpdate, Request
@@ -118,9 +119,12 @@ class Page:
         gui.add_html(KEYS)
         self.driver = Driver(load, start, self.show, folder, ahead=serve.ahead)
         self._add_driving()
+        self._joints = JointsPanel(self._server, self._put)
         self._add_editing()
         self._add_starting()
         self._files = FilesPanel(self._server, self._put)
+        if self.driver.engine is not None:  # it loaded while the page was being built
+            self._show_choices(PageUpdate("", engine=self.driver.engine))
 
     def close(self) -> None:
         """End the drive and the server."""
@@ -282,6 +286,10 @@ class Page:
         count = str(shown.engine.sampler_steps) if shown.engine is not None else "0"
         if shown.engine is not None:
             self._editing.visible = shown.engine.editable
+            self._joints.show(shown.engine.body)
+            now = shown.session
+            if now is not None and now.wished_A is not None and not now.steps:
+                self._joints.set(now.wished_A[:-2])  # another drive, or an opened world
             self._steps.visible = count != "0"
         if count not in ("0", self._steps.value):
             self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))

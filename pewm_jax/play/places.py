@@ -11,7 +11,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from pewm_jax.bodies.humanoid import BODIES
 from pewm_jax.config import UserError, World
+from pewm_jax.data.agent import Agent, open_agent
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.episodes import DEPTH_LIMIT_M
 from pewm_jax.data.importer import ImportConfig, import_recording
@@ -41,6 +43,9 @@ class StartPoint:
         planar_3: x, y, yaw of the present in a house or mesh, else None.
         simulator: the house or mesh, which provides the ground truth and collisions, else None.
         blocks: the cells as which the house or mesh is shown; None for its surfaces.
+        agent: the body of the agent, if its degrees of freedom steer the model.
+        state_A: its state at the present frame.
+        floor_z: height of the floor below it, metres.
     """
 
     name: str
@@ -48,20 +53,30 @@ class StartPoint:
     planar_3: np.ndarray | None = None
     simulator: Simulator | None = None
     blocks: VoxelsConfig | None = None
+    agent: Agent | None = None
+    state_A: np.ndarray | None = None
+    floor_z: float = 0.0
 
 
 def open_place(
-    start: Start, height: int, width: int, blocks: VoxelsConfig | None = None
+    start: Start, height: int, width: int, blocks: VoxelsConfig | None = None, body: str = ""
 ) -> StartPoint:
     """Open the scene in which a drive starts, for images of this size.
 
-    Houses and meshes are shown as ``blocks``, if they are given.
+    Houses and meshes are shown as ``blocks``, if they are given. ``body`` is the name of the body
+    that the agent has; "" for a camera that moves on the ground.
 
     Raises:
         UserError: the scene does not exist or cannot be used.
     """
     if start.episode:
-        return _episode(Path(start.episode), start.number, start.frames, height, width)
+        place = _episode(Path(start.episode), start.number, start.frames, height, width)
+        return _embodied(start, place, body) if body else place
+    if start.recording and body:
+        raise UserError(
+            f"This world is steered by the joints of a body ({body}), which a recording does not "
+            "show: start in a house, or with an episode of its data."
+        )
     if start.recording:
         return _recording(start, height, width)
     simulator = open_simulator(
@@ -77,10 +92,44 @@ def open_place(
     around = np.tile(planar, (LOOKS, 1))
     around[:-1, 2] += 2 * np.pi * np.arange(1, LOOKS) / LOOKS
     name = Path(start.scene).name if start.scene else f"house {start.house}"
-    poses = np.stack([simulator.world_from_camera(pose) for pose in around])
-    camera = Camera(np.tile(simulator.intrinsics_4, (LOOKS, 1)), poses)
-    seen = _rendered(simulator, blocks, camera, height, width)
-    return StartPoint(name, seen, planar, simulator, blocks)
+    if not body:
+        poses = np.stack([simulator.world_from_camera(pose) for pose in around])
+        camera = Camera(np.tile(simulator.intrinsics_4, (LOOKS, 1)), poses)
+        seen = _rendered(simulator, blocks, camera, height, width)
+        return StartPoint(name, seen, planar, simulator, blocks)
+    agent = open_agent(body, start.camera_height)
+    place = StartPoint(
+        name,
+        simulator.frames(around[-1:]),
+        planar,
+        simulator,
+        agent=agent,
+        state_A=agent.body.rest,
+        floor_z=float(simulator.grid.floor_z),
+    )
+    camera = agent.camera(
+        planar[None], agent.body.rest[None], simulator.intrinsics_4[None], place.floor_z
+    )
+    seen = truth(place, camera, height, width, (planar, agent.body.rest))
+    assert seen is not None
+    return dataclasses.replace(place, frames=seen)
+
+
+def _embodied(start: Start, place: StartPoint, body: str) -> StartPoint:
+    """Return the start in an episode whose agent has a body."""
+    episode = EpisodeSource(Path(start.episode))[start.number]
+    about = episode.info.get("body") or {}
+    if about.get("name") != body or episode.states is None:
+        raise UserError(
+            f"episode {episode.name} was not recorded by the body {body}, whose joints steer this "
+            f"world: use data collected with --body {body}."
+        )
+    agent = open_agent(body, about["scale"] * BODIES[body].eye_m)
+    present = min(start.frames, episode.length) - 1
+    state = np.asarray(episode.states[present], np.float64)
+    planar = agent.body.planar_of(episode.world_from_camera[present], state, agent.scale)
+    floor_z = float(episode.info.get("floor_z_m", 0.0))
+    return dataclasses.replace(place, planar_3=planar, agent=agent, state_A=state, floor_z=floor_z)
 
 
 def blocks_of(model: World) -> VoxelsConfig | None:
@@ -119,12 +168,27 @@ def require_shown(model: World, start: Start) -> None:
         )
 
 
-def truth(place: StartPoint, camera: Camera, height: int, width: int) -> Frames | None:
-    """Return the ground truth of (T,) cameras, or None if it is unknown."""
+def truth(
+    place: StartPoint,
+    camera: Camera,
+    height: int,
+    width: int,
+    posture: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Frames | None:
+    """Return the ground truth of (T,) cameras, or None if it is unknown.
+
+    ``posture`` is the pose x, y, yaw and the state of the agent's body, which is then in the
+    pictures.
+    """
     if place.simulator is None:
         return None
     host = Camera(np.asarray(camera.intrinsics_4), np.asarray(camera.world_from_camera))
-    return _rendered(place.simulator, place.blocks, host, height, width)
+    if posture is None or place.agent is None:
+        return _rendered(place.simulator, place.blocks, host, height, width)
+    seen = render(place.simulator.scene, host, height, width)
+    planar, state = (np.repeat(x[None], len(host.world_from_camera), 0) for x in posture)
+    place.agent.render_over(seen, planar, state, host, place.floor_z, 0)
+    return Frames(seen.rgb_THWC, _measured(seen.depth_THW), host)
 
 
 def _rendered(
@@ -134,25 +198,34 @@ def _rendered(
     scene = simulator.scene
     if blocks is None:
         seen = render(scene, camera, height, width)
-        depth = np.where(seen.depth_THW <= DEPTH_LIMIT_M, seen.depth_THW, np.float32(0))
-        return Frames(seen.rgb_THWC, depth, camera)
+        return Frames(seen.rgb_THWC, _measured(seen.depth_THW), camera)
     eye = np.asarray(camera.world_from_camera)[:, :3, 3]
     voxels = record_voxels(blocks, scene, float(simulator.grid.floor_z), eye)
     seen = draw_blocks(voxels, camera, height, width)
     return Frames(seen.rgb_THWC, seen.depth_THW, camera)
 
 
+def _measured(depth: np.ndarray) -> np.ndarray:
+    """Return depth with 0 where an episode's depth cannot be recorded."""
+    return np.where(depth <= DEPTH_LIMIT_M, depth, np.float32(0))
+
+
 def walk(
-    place: StartPoint, planar_3: np.ndarray, action_3: np.ndarray, *, walls: bool = True
+    place: StartPoint,
+    planar_3: np.ndarray,
+    action_3: np.ndarray,
+    *,
+    walls: bool = True,
+    sliding: bool = True,
 ) -> tuple[np.ndarray, bool]:
     """Return the next planar pose, and whether a wall blocked the move.
 
-    The agent slides along walls. An agent outside the free area (after driving through walls) can
-    go anywhere.
+    The agent slides along walls, if ``sliding``. An agent outside the free area (after driving
+    through walls) can go anywhere.
     """
     simulator = place.simulator
     if walls and simulator is not None and bool(is_free(simulator.grid, planar_3[:2])):
-        return move(simulator.grid, planar_3, action_3, sliding=True)
+        return move(simulator.grid, planar_3, action_3, sliding=sliding)
     x, y, yaw = np.asarray(planar_3, np.float64)
     dx, dy, dyaw = np.asarray(action_3, np.float64)
     ahead = np.array([np.cos(yaw) * dx - np.sin(yaw) * dy, np.sin(yaw) * dx + np.cos(yaw) * dy])
@@ -176,6 +249,22 @@ def way(before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: floa
     poses = before_3 + share * (np.array([*after_3[:2], before_3[2] + turn]) - before_3)
     actions = [action_between(a, b) for a, b in itertools.pairwise(poses)]
     return np.stack(actions) if actions else np.zeros((0, 3), np.float32)
+
+
+def forward_way(
+    before_3: np.ndarray, after_3: np.ndarray, step_m: float, turn_deg: float
+) -> np.ndarray:
+    """Return (n, 3) actions that turn to a place, walk there, and turn to its heading."""
+    (dx, dy), far = after_3[:2] - before_3[:2], float(np.linalg.norm(after_3[:2] - before_3[:2]))
+    course = float(np.arctan2(dy, dx)) if far > 1e-6 else float(after_3[2])
+    corners = [
+        before_3,
+        np.array([*before_3[:2], course]),
+        np.array([*after_3[:2], course]),
+        np.asarray(after_3, np.float64),
+    ]
+    ways = [way(a, b, step_m, turn_deg) for a, b in itertools.pairwise(corners)]
+    return np.concatenate(ways)
 
 
 def fitted(frames: Frames, height: int, width: int) -> Frames:

@@ -36,18 +36,34 @@ def path_of(folder: Path, name: str) -> Path:
     return folder / f"{name}{SUFFIX}"
 
 
-def save(engine: Engine, world: WorldState, folder: Path, name: str) -> Path:
+def save(
+    engine: Engine,
+    world: WorldState,
+    folder: Path,
+    name: str,
+    state_A: np.ndarray | None = None,
+) -> Path:
     """Write a world: its present frame and its map; one of the same name is replaced.
 
-    The settings of the model's clip and memory are stored in the file.
+    The settings of the model's clip and memory, and the state of the agent's body if it has one,
+    are stored in the file.
 
     Raises:
         ConfigError: the name is not plain.
     """
     path = path_of(folder, name)
     host = {name: np.asarray(x) for name, x in tree.flatten(world).items()}
-    weights.save(path, tree.unflatten(host), {"format": FORMAT, "of": _facts(engine)})
+    facts = {"format": FORMAT, "of": _facts(engine)}
+    if state_A is not None:
+        facts["state"] = json.dumps(np.asarray(state_A).tolist())
+    weights.save(path, tree.unflatten(host), facts)
     return path
+
+
+def posture(folder: Path, name: str) -> np.ndarray | None:
+    """Return the state of the agent's body in a saved world; None if it has none."""
+    facts = weights.metadata(path_of(folder, name))
+    return np.array(json.loads(facts["state"])) if "state" in facts else None
 
 
 def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldState:
@@ -77,7 +93,8 @@ def load(engine: Engine, like: WorldState, folder: Path, name: str) -> WorldStat
 def _facts(engine: Engine) -> str:
     """Return the settings that two models must share to exchange worlds."""
     sections = (engine.model.clip, getattr(engine.model, "memory", engine.model))
-    return json.dumps([serialize.to_dict(section) for section in sections], sort_keys=True)
+    own = [engine.body] if engine.body else []
+    return json.dumps([serialize.to_dict(section) for section in sections] + own, sort_keys=True)
 
 
 FPS = 6

@@ -15,13 +15,14 @@ from typing import TypeAlias
 import jax
 import numpy as np
 
+from pewm_jax.bodies import kinematics
 from pewm_jax.config import UserError
 from pewm_jax.geometry.actions import heading
 from pewm_jax.play import places
 from pewm_jax.play.engine import Engine
 from pewm_jax.play.places import StartPoint
 from pewm_jax.play.settings import Start
-from pewm_jax.types import Array, WorldState
+from pewm_jax.types import Array, Control, WorldState
 
 MOST_PATH = 4096
 """Largest number of positions of the path."""
@@ -61,13 +62,23 @@ class Move:
 
 
 @dataclasses.dataclass(frozen=True)
+class Pose:
+    """Event: set the joints that the body of the agent moves to, in the following steps.
+
+    ``joints`` are the values of its degrees of freedom, without the two of walking.
+    """
+
+    joints: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class Walls:
     """Event: set whether walls stop the agent."""
 
     stop: bool
 
 
-Event: TypeAlias = Drive | Erase | Move | Walls
+Event: TypeAlias = Drive | Erase | Move | Walls | Pose
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,9 +94,11 @@ class Session:
         steps: number of steps made, edits included.
         seed: seed of the noise.
         walls: whether walls stop the agent.
-        due: the action that ``blind`` has yet to make, and its key; None if there is none.
+        due: the step that ``blind`` has yet to make, and its key; None if there is none.
         observed: whether the present frame was observed, not imagined.
         said: a message about the last event.
+        state_A: the state of the agent's body, if it has one.
+        wished_A: the state that its joints move to.
     """
 
     place: StartPoint
@@ -96,9 +109,11 @@ class Session:
     steps: int = 0
     seed: int = 0
     walls: bool = True
-    due: tuple[np.ndarray, Array] | None = None
+    due: tuple[np.ndarray | Control, Array] | None = None
     observed: bool = False
     said: str = ""
+    state_A: np.ndarray | None = None
+    wished_A: np.ndarray | None = None
 
 
 def begin(engine: Engine, place: StartPoint, seed: int = 0) -> Session:
@@ -108,27 +123,55 @@ def begin(engine: Engine, place: StartPoint, seed: int = 0) -> Session:
     return dataclasses.replace(_initial_session(place, world, seed, said), observed=True)
 
 
-def resume(session: Session, world: WorldState, said: str) -> Session:
-    """Return a drive through another world, such as a saved one, with the same start point."""
+def resume(
+    session: Session, world: WorldState, said: str, state_A: np.ndarray | None = None
+) -> Session:
+    """Return a drive through another world, such as a saved one, with the same start point.
+
+    ``state_A`` is the state of the agent's body there, if it has one.
+    """
     return dataclasses.replace(
-        _initial_session(session.place, world, session.seed, said), walls=session.walls
+        _initial_session(session.place, world, session.seed, said, state_A), walls=session.walls
     )
 
 
 def wanted(session: Session, event: Drive) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return the effect of a step with collisions: ``(action_3, planar_3, collided)``.
+    """Return the effect of a step with collisions: ``(action, planar_3, collided)``.
 
     These are the action that is possible, the pose x, y, yaw after it, and whether a wall blocked
-    the requested action.
+    the requested action. The action of a body is its next state; it walks forward and turns.
     """
     asked = np.asarray(event.action, np.float32)
+    agent, state = session.place.agent, session.state_A
+    if agent is not None and state is not None and session.wished_A is not None:
+        body = agent.body
+        asked = np.clip([asked[0], asked[2]], body.low[-2:], body.high[-2:])
+        moved = np.array([asked[0], 0.0, asked[1]])
+        after, collided = places.walk(
+            session.place, session.planar_3, moved, walls=session.walls, sliding=False
+        )
+        action = body.toward(state, session.wished_A)
+        action[-2:] = (0.0 if collided else asked[0]), asked[1]
+        return action.astype(np.float32), after, collided
     after, collided = places.walk(session.place, session.planar_3, asked, walls=session.walls)
     return places.action_between(session.planar_3, after), after, collided
 
 
-def ahead(engine: Engine, session: Session, action_3: np.ndarray) -> WorldState:
+def ahead(engine: Engine, session: Session, action: np.ndarray) -> WorldState:
     """Return the world after one action, for the argument ``made`` of ``apply``."""
-    return engine.imagine(session.world, action_3, key_of(session))
+    return engine.imagine(session.world, step_of(session, action), key_of(session))
+
+
+def step_of(session: Session, action: np.ndarray) -> np.ndarray | Control:
+    """Return an action as the model takes it: with camera and state if the agent has a body."""
+    agent = session.place.agent
+    if agent is None:
+        return action
+    planar = kinematics.advance(session.planar_3, action)
+    intrinsics = np.asarray(session.world.frame.camera.intrinsics_4, np.float32)
+    camera = agent.camera(planar[None], action[None], intrinsics, session.place.floor_z)
+    actions = np.asarray(action, np.float32)[None]
+    return Control(camera, actions, np.asarray(session.state_A, np.float32))
 
 
 def apply(
@@ -144,6 +187,8 @@ def apply(
     if isinstance(event, Walls):
         said = "Walls stop the agent." if event.stop else "The agent passes through walls."
         return dataclasses.replace(session, walls=event.stop, said=said)
+    if isinstance(event, Pose):
+        return _apply_pose(session, event)
     if isinstance(event, Drive):
         return _apply_drive(engine, session, event, made)
     return _apply_edit(engine, session, event)
@@ -169,10 +214,29 @@ def _apply_drive(
     engine: Engine, session: Session, event: Drive, made: WorldState | None
 ) -> Session:
     action, planar, collided = wanted(session, event)
-    if collided and not np.abs(action).max() > 1e-6:
+    moves = np.abs(action if session.state_A is None else action[-2:]).max() > 1e-6
+    if collided and not moves:
         return dataclasses.replace(session, said="Blocked by a wall.")
     world = ahead(engine, session, action) if made is None else made
-    return _next_session(engine, session, world, action, planar, "")
+    after = _next_session(engine, session, world, step_of(session, action), planar, "")
+    if session.state_A is not None:
+        after = dataclasses.replace(after, state_A=action.astype(np.float64))
+    return after
+
+
+def _apply_pose(session: Session, event: Pose) -> Session:
+    """Set the joints that the body moves to; nothing is imagined yet."""
+    agent = session.place.agent
+    if agent is None or session.wished_A is None:
+        raise UserError("This agent has no joints: it is a camera that moves on the ground.")
+    joints = np.asarray(event.joints, np.float64)
+    if joints.shape != (agent.body.size - 2,) or not np.isfinite(joints).all():
+        raise UserError(
+            f"A pose of the body {agent.body.name} has {agent.body.size - 2} finite numbers, one "
+            "for each joint."
+        )
+    wished = np.clip(np.append(joints, [0.0, 0.0]), agent.body.low, agent.body.high)
+    return dataclasses.replace(session, wished_A=wished, said="The body moves.")
 
 
 def _apply_edit(engine: Engine, session: Session, event: Erase | Move) -> Session:
@@ -213,7 +277,7 @@ def _next_session(
     engine: Engine,
     session: Session,
     world: WorldState,
-    action: np.ndarray,
+    step: np.ndarray | Control,
     planar: np.ndarray,
     said: str,
 ) -> Session:
@@ -224,18 +288,31 @@ def _next_session(
         planar_3=planar,
         path_P3=np.concatenate([session.path_P3, here[None]])[-MOST_PATH:],
         steps=session.steps + 1,
-        due=(action, key_of(session)) if engine.has_memory else None,
+        due=(step, key_of(session)) if engine.has_memory else None,
         observed=False,
         said=said,
     )
 
 
-def _initial_session(place: StartPoint, world: WorldState, seed: int, said: str) -> Session:
+def _initial_session(
+    place: StartPoint,
+    world: WorldState,
+    seed: int,
+    said: str,
+    state_A: np.ndarray | None = None,
+) -> Session:
     camera = np.asarray(world.frame.camera.world_from_camera)[0]
-    planar = np.array([camera[0, 3], camera[1, 3], float(heading(camera))], np.float64)
+    state, agent = place.state_A if state_A is None else state_A, place.agent
+    if agent is not None and state is not None:
+        planar = agent.body.planar_of(camera, state, agent.scale)
+    else:
+        planar = np.array([camera[0, 3], camera[1, 3], float(heading(camera))], np.float64)
     if place.planar_3 is not None and np.allclose(planar[:2], place.planar_3[:2], atol=1e-4):
         planar = place.planar_3.copy()  # exact: rounding could put the agent into a wall
-    return Session(place, world, world, planar, camera[None, :3, 3], seed=seed, said=said)
+    path = camera[None, :3, 3]
+    return Session(
+        place, world, world, planar, path, seed=seed, said=said, state_A=state, wished_A=state
+    )
 
 
 def key_of(session: Session) -> Array:

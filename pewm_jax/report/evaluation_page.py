@@ -15,6 +15,7 @@ from pewm_jax.report.labels import (
     MASK_NAMES,
     METHOD_NAMES,
     METRIC_NAMES,
+    PUBLISHED_FRAMES,
     RIVALS,
     TRUTH_NAME,
     heading,
@@ -279,7 +280,7 @@ def steering_scores(metrics: Mapping[str, Any]) -> Section | None:
     for name, one in found.items():
         digits = 1 if name == "scs" else 3
         frames = len(one["per_frame"]["true"]["mean"])
-        columns = sorted({0, *(t - 1 for t in (4, 8, 16) if t <= frames), frames - 1})
+        columns = sorted({0, *(t - 1 for t in PUBLISHED_FRAMES if t <= frames), frames - 1})
         rows.append(heading_row(one["name"]))
         labels = {**ACTIONS_NAMES, "truth": TRUTH_NAME}
         for kind, label in labels.items():

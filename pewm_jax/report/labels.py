@@ -52,6 +52,8 @@ COVERAGE_NAMES = {
     "attended": "among those that the frame's own camera would attend to",
 }
 """Labels of the shares of pixels seen before."""
+PUBLISHED_FRAMES = (4, 8, 16)
+"""Imagined frames at which EgoWM's tables have scores."""
 ACTIONS_NAMES = {
     "true": "the true actions",
     "shuffled": "another clip's actions",
@@ -253,6 +255,29 @@ def format_steering(metrics: Mapping[str, Any]) -> list[str]:
             if one["all"].get(kind, {}).get("mean") is not None
         )
         lines.append(f"{one['name']} with actions: {'; '.join(values)}.")
+    return [*lines, *compare_steering(found)]
+
+
+def compare_steering(found: Mapping[str, Any]) -> list[str]:
+    """Return the scores of the true actions relative to copying and to another clip's actions.
+
+    ``found`` is the entry ``steering`` of ``metrics.json``. What has no score is left out.
+    """
+    lines, scores = [], found.get("scores", {})
+    if "lpips" in scores:
+        each = (scores["lpips"]["per_frame"][kind]["mean"] for kind in ("true", "copy"))
+        pairs = dict(enumerate(zip(*each, strict=True), 1))
+        said = [
+            f"{true:.3f} against {copy:.3f} ({100 * (true / copy - 1):+.1f} %) at frame {t}"
+            for t, (true, copy) in pairs.items()
+            if t in PUBLISHED_FRAMES and None not in (true, copy) and copy > 0
+        ]
+        lines += [f"LPIPS, true actions against copying: {'; '.join(said)}."] * bool(said)
+    for name, title in (("scs", "SCS"), ("arms", "IoU of the arms")):
+        whole = scores.get(name, {}).get("all", {})
+        true, other = (whole.get(kind, {}).get("mean") for kind in ("true", "shuffled"))
+        if true is not None and other:
+            lines.append(f"{title}, true actions / another clip's: {true / other:.2f}.")
     return lines
 
 

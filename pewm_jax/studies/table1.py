@@ -23,7 +23,7 @@ from pewm_jax.eval import statistics
 from pewm_jax.eval.metrics.images import MASKS
 from pewm_jax.eval.statistics import scores
 from pewm_jax.io import atomic
-from pewm_jax.studies import table1_page, table1_rows, table1_training
+from pewm_jax.studies import step_times, table1_page, table1_rows
 from pewm_jax.studies.table1_page import GAP, SETS
 from pewm_jax.studies.table1_rows import CONTROL, PAPER_FORM, Row
 from pewm_jax.studies.table1_scoring import (
@@ -219,7 +219,7 @@ def _facts(
         "house": scorer.house,
         "frames": scorer.frames,
         "pixels": [study.base.model.clip.height, study.base.model.clip.width],
-        "clock": "processor" if table1_training.clock() is time.process_time else "wall",
+        "clock": "processor" if step_times.clock() is time.process_time else "wall",
         "context": scorer.config.data.context,
         "batch": STAGES[0].settings(study.base).batch,
         "left_out": dict(scorer.left_out),

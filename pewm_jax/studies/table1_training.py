@@ -13,34 +13,27 @@ measurements are stored in ``plan.json`` with the settings they are valid for, a
 from __future__ import annotations
 
 import dataclasses
-import functools
 import gc
 import json
 import math
 import shutil
-import statistics
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from pewm_jax import config as configuration
 from pewm_jax import shipped
 from pewm_jax.config import Config, StageConfig, UserError
-from pewm_jax.data import loader
 from pewm_jax.data.dataset import MANIFEST
 from pewm_jax.errors import require
 from pewm_jax.io import atomic, weights
 from pewm_jax.io.store import file_hash, inputs_hash, make_once
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models.dinov2 import model as dinov2
-from pewm_jax.nn import target
+from pewm_jax.studies import step_times
 from pewm_jax.studies.table1_rows import Row, as_kind
-from pewm_jax.train import loop, sharding
+from pewm_jax.train import loop
 from pewm_jax.train.runs import WEIGHTS
-from pewm_jax.train.step import compile_step, initial_state, noise_key
 from pewm_jax.worlds.pewm.world import PEWM, STAGES
 
 CODEC, MADE_FROM = "codec", "made_from.json"
@@ -192,8 +185,6 @@ def _start(study: Study) -> Path:
     return folder
 
 
-ROUNDS = 7
-"""Number of timed steps of each training, in turn; one more step before them is not timed."""
 PLAN = "plan.json"
 UNREAD = "weights that are not read"
 """Placeholder for the start weights when settings are only inspected."""
@@ -263,49 +254,10 @@ def _model(study: Study, row: Row) -> str:
     return inputs_hash(facts)[:16]
 
 
-def clock() -> Callable[[], float]:
-    """Return the clock for training time: processor time, or wall-clock time on an accelerator."""
-    return time.process_time if target.current().platform == "cpu" else time.perf_counter
-
-
 def _measure(study: Study, models: dict[str, Row], log: Log) -> Times:
     """Return the median seconds per step of each model, measured in turn."""
-    log(f"timing a step of {len(models)} trainings …")
-    steps = {model: _compile_step(study, row, log) for model, row in models.items()}
-    taken: dict[str, list[float]] = {model: [] for model in steps}
-    now = clock()
-    for number in range(ROUNDS + 1):
-        for model, step in steps.items():
-            began = now()
-            step()
-            if number:
-                taken[model].append(now() - began)
-    found = {model: statistics.median(each) for model, each in taken.items()}
-    for model, seconds in found.items():
-        spread = f"{min(taken[model]):.3f} to {max(taken[model]):.3f}"
-        log(f"  {models[model].name}: {seconds:.3f} s per step ({spread})")
-    del steps
-    gc.collect()
-    return found
-
-
-def _compile_step(study: Study, row: Row, log: Log) -> Callable[[], None]:
-    """Compile a row's training step; return a function that runs one step on random weights."""
-    config = settings(study, row, 0, 1, start=UNREAD)
-    stage, mesh = STAGES[1 if row.reads else 0], sharding.make_mesh(arranged=config.train.mesh)
-    batch = next(iter(loader.clips(config, "train", seed=0, batch=stage.settings(config).batch)))
-    key = jax.device_put(noise_key(config, stage), sharding.replicated(mesh))
-    held = [initial_state(config, stage, mesh, None)]
-    if config.data.prepared:
-        assert stage.prepare is not None
-        batch = jax.jit(functools.partial(stage.prepare, config.model))(held[0].params, batch)
-    clip = jax.device_put(jax.device_get(batch), sharding.of_batch(mesh))
-    began = time.monotonic()
-    compiled = compile_step(config, stage, mesh, clip)
-    log(f"  {row.name}: compiled in {time.monotonic() - began:.0f} s")
-
-    def step() -> None:
-        held[0], metrics = compiled(held[0], clip, key)
-        jax.block_until_ready(metrics)
-
-    return step
+    trainings = {
+        model: (row.name, settings(study, row, 0, 1, start=UNREAD), STAGES[1 if row.reads else 0])
+        for model, row in models.items()
+    }
+    return step_times.measure(trainings, log)

@@ -284,7 +284,9 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
     if "backbone" not in stage.prepares_by:
         for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
             model.pop(part, None)
-    reader = model.get("memory", {}).get("reader", {})
+    reader, control = model.get("memory", {}).get("reader", {}), model.get("control", {})
+    for setting in ("inject", "body"):  # what is prepared does not depend on them
+        control.pop(setting, None)
     # The only values of earlier versions, whose prepared clips are still used.
     earlier = (reader, "picture", "pixels"), (model, "observed", "first")
     earlier = (*earlier, (model.get("noise", {}), "rendered_until", 0.0))

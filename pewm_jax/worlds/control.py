@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -92,8 +93,12 @@ def _require_cameras(camera: Camera) -> int:
     return count
 
 
-def cut_into_clips(asked: Control, length: int) -> tuple[Control, Array | None]:
+def cut_into_clips(
+    asked: Control, length: int, still: Callable[[Array], Array]
+) -> tuple[Control, Array | None]:
     """Cut the control of n frames into clips that imagine ``length`` frames each.
+
+    ``still`` returns the action with which the agent stands still (``Conditioner.still``).
 
     Returns:
         ``(chunks, wanted)``: the control with leading axes (clips, length), and which of these
@@ -105,8 +110,8 @@ def cut_into_clips(asked: Control, length: int) -> tuple[Control, Array | None]:
     clips = -(-count // length)
     missing = clips * length - count
 
-    def whole(x: Array, still: Array) -> Array:
-        filled = jnp.concatenate([x, jnp.repeat(still, missing, 0)]) if missing else x
+    def whole(x: Array, last: Array) -> Array:
+        filled = jnp.concatenate([x, jnp.repeat(last, missing, 0)]) if missing else x
         return filled.reshape(clips, length, *x.shape[1:])
 
     camera = jax.tree.map(lambda x: whole(x, x[-1:]), asked.camera)
@@ -115,7 +120,7 @@ def cut_into_clips(asked: Control, length: int) -> tuple[Control, Array | None]:
         if state is not None:
             later = actions[length - 1 : (clips - 1) * length : length]
             state = jnp.concatenate([state[None], later])
-        actions = whole(actions, jnp.zeros_like(actions[:1]))
+        actions = whole(actions, still(actions[-1:]))
     wanted = jnp.arange(clips * length).reshape(clips, length) < count if missing else None
     return Control(camera, actions, state), wanted
 

@@ -132,7 +132,10 @@ def loss(
         model, train, params, clip, x0, readout, (key, level_key, image_key), history
     )
     require_actions(model, clip.actions_TA, "the loss")
-    control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
+    state = clip.extras.get("state_A")
+    if state is not None and clip.actions_TA is not None and history > 1:
+        state = clip.actions_TA[:, history - 2]  # the one at the last observed frame
+    control = Control(frames.camera, clip.actions_TA, state)
     conditioning = world_model.condition(model, params, observed, control, **more)
     if blind:
         hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (len(x0),))

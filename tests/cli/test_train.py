@@ -243,6 +243,7 @@ COMMANDS = {
     "push": ("pewm-jax push", ["-m", "pewm_jax", "push"]),
     "horizon": ("pewm-jax horizon", ["-m", "pewm_jax", "horizon"]),
     "table1": ("pewm-jax table1", ["-m", "pewm_jax", "table1"]),
+    "conditioning": ("pewm-jax conditioning", ["-m", "pewm_jax", "conditioning"]),
 }
 """Each subcommand: the words it is called by without ``pewm-jax``, and how to call it so."""
 INTERRUPTED_AT_JAX = """

@@ -117,6 +117,28 @@ def test_two_convolutions_lead_down_to_the_latent_rate():
     assert steps == {1: (1, 1), 2: (2, 1), 4: (2, 2), 8: (4, 2)}
 
 
+@pytest.mark.parametrize("projection", ["sinusoid", "convolution"])
+def test_actions_before_the_last_observed_frame_change_nothing(projection):
+    model = model_of(4, projection=projection)
+    assert model.clip.frames == 9
+    params = randomised(model.control.init, model, jax.random.key(0))
+    made = steered(model, actions_of(model), params, observed=5).modulation_BtE
+    assert np.abs(made[:, 2]).max() > 1e-3
+    earlier = actions_of(model)
+    earlier[:, :4] = 0  # as in rollouts, where they are unknown
+    other = steered(model, earlier, params, observed=5).modulation_BtE
+    np.testing.assert_array_equal(made, other)
+
+
+def test_standing_still_keeps_joints_and_stops_walking():
+    last = np.arange(1, 26, dtype=np.float32)
+    body = ModulationConfig(actions=25, state=25, angles=(), body="humanoid", **WIDE)
+    np.testing.assert_array_equal(body.still(last), [*last[:-2], 0, 0])
+    states = dataclasses.replace(body, body="")
+    np.testing.assert_array_equal(states.still(last), last)
+    np.testing.assert_array_equal(ModulationConfig().still(last[:3]), np.zeros(3))
+
+
 def test_rays_are_joined_where_they_are_asked_for():
     model = model_of(rays=True)
     assert model.in_channels == 2 * model.codec.channels + 24

@@ -1,5 +1,6 @@
 """A run goes in, a folder that `pewm_jax.load` reads and that describes itself comes out."""
 
+import dataclasses
 import json
 
 import jax
@@ -9,7 +10,7 @@ import pytest
 
 import pewm_jax
 from pewm_jax import config as configuration
-from pewm_jax import worlds
+from pewm_jax import presets, worlds
 from pewm_jax.config import ClipConfig, UserError
 from pewm_jax.convert import inference
 from pewm_jax.diffusion.ddpm import DDPMConfig
@@ -136,3 +137,33 @@ def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, tmp_path):
     with pytest.raises(UserError, match="truncated"):
         inference.export(run, tmp_path / "x", log=lambda _: None)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["runs", "there"]
+
+
+def test_the_card_of_a_body_says_how_it_is_steered_and_how_well():
+    def entry(mean):
+        return {"mean": mean, "low": None, "high": None}
+
+    lead = {"true": entry(18.0), "true - shuffled": entry(2.5)}
+    arms = {"name": "IoU of the arms", "all": {"true": entry(0.6), "shuffled": entry(0.2)}}
+    steering = {"clips": 48, "forward": 0.4, "all": lead, "scores": {"arms": arms}}
+    facts = inference.CardFacts(
+        name="body",
+        dtype="float16",
+        version="0",
+        config=presets.load("egowm_humanoid"),
+        params={},
+        stage="2",
+        step="5",
+        base=None,
+        metrics={**METRICS, "steering": steering},
+    )
+    card = inference.write_card(facts)
+    assert "state, control, jax.random.key(0)" in card
+    assert "(n, 25) actions of the body `humanoid`, (25,) state of the agent" in card
+    assert "given a frame and an agent's actions" in card
+    assert "with no memory, codec `learned`." in card
+    assert "1 to 1 actions a frame." in card  # no earlier frames
+    assert "With other actions (48 clips, 40 % of whose steps go forward):" in card
+    assert "- IoU of the arms, true actions / another clip's: 3.00." in card
+    walks = dataclasses.replace(facts, config=presets.load("egowm"), metrics=METRICS)
+    assert "state, [0] * 8, jax.random.key(0)" in inference.write_card(walks)

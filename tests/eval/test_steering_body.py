@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import types
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from pewm_jax import presets
 from pewm_jax.config import ClipConfig
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
-from pewm_jax.eval import clips, steering
+from pewm_jax.eval import clips, evaluate, steering
 from pewm_jax.eval.metrics.structure import Consistency, follow_by_flow
 from pewm_jax.eval.walks import choose_walks
 from pewm_jax.report import evaluation_page
@@ -126,6 +127,28 @@ def test_arms_and_objects_are_scored_by_kind_of_actions(told):
     sentences = format_steering({"steering": facts, "protocol": {}})
     assert any(one.startswith("IoU of the arms with actions: true") for one in sentences)
     assert any("frame 8:" in line for line in found.lines())
+
+
+def test_a_report_measures_steering_although_the_camera_on_the_head_moves_freely(monkeypatch):
+    choices = clips.choose(config(), episodes(), 3, 2)
+    assert clips.needs_cameras(episodes(), choices)
+    for name in ("score_table", "roll_long", "mirror_test"):
+        monkeypatch.setattr(evaluate, name, lambda *_, **__: None)
+    monkeypatch.setattr(evaluate, "way_out", lambda *_: (None, None))
+    monkeypatch.setattr(evaluate.voxel_report, "score", lambda *_: None)
+    asked = []
+    monkeypatch.setattr(
+        evaluate.steering, "score", lambda *given: asked.append(given[-1]) or ("scores", "clips")
+    )
+    metrics = types.SimpleNamespace(lpips=None, i3d=None, structure=None, visits={})
+    loaded = types.SimpleNamespace(params={})
+    job = types.SimpleNamespace(
+        config=config(), episodes=episodes(), metrics=metrics, loaded=loaded
+    )
+    methods = types.SimpleNamespace(remembers=False, model=types.SimpleNamespace(cameras=True))
+    measured = evaluate._measure(job, methods, None, choices, [], print)
+    assert measured.steered == "scores"
+    assert asked == [steering.Measures(arms=True)]
 
 
 def test_episodes_without_a_body_have_no_arms():

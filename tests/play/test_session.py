@@ -95,7 +95,7 @@ def test_the_commands_of_the_documentation_can_be_read_and_its_buttons_are_there
     for flag in set(re.findall(r"`(--[\w-]+)", PAGE)):
         value = {"--host": ["0.0.0.0"], "--frames": ["8"], "--worlds": ["here"]}.get(flag, [])
         cli.parse(play.Settings, ["small", flag, *value], prog="pewm-jax play")
-    code = (ROOT / "pewm_jax" / "play" / "page.py").read_text()
+    code = "".join(path.read_text() for path in (ROOT / "pewm_jax" / "play").glob("*.py"))
     for button in re.findall(r"(?<!\*)\*([A-Z][^*\n]+)\*(?!\*)", PAGE):
         assert f'"{button}"' in code, button
     assert (ROOT / "docs" / "play.png").stat().st_size < 400_000

@@ -13,3 +13,22 @@ def test_the_room_of_a_map_is_said_where_it_is_known():
     (unknown,) = labels.format_map_growth(growth(None))
     assert known.endswith("in 8 imagined frames, with a capacity of 256.")
     assert unknown.endswith("from 10 to 20 points in 8 imagined frames.")
+
+
+def test_steering_is_compared_at_the_frames_of_the_paper():
+    def entry(mean):
+        return {"mean": mean, "low": None, "high": None}
+
+    copy, true = [0.5] * 8, [0.4] * 8
+    true[3], true[7] = 0.25, None
+    lpips = {
+        "per_frame": {"true": entry(true), "copy": entry(copy)},
+        "all": {"true": entry(0.4), "copy": entry(0.5)},
+    }
+    scs = {"all": {"true": entry(45.0), "shuffled": entry(30.0)}}
+    found = {"scores": {"lpips": lpips, "scs": scs, "arms": {"all": {"true": entry(None)}}}}
+    assert labels.compare_steering(found) == [
+        "LPIPS, true actions against copying: 0.250 against 0.500 (-50.0 %) at frame 4.",
+        "SCS, true actions / another clip's: 1.50.",
+    ]
+    assert labels.compare_steering({}) == []

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pewm_jax import presets
 from pewm_jax.config import UserError
 from pewm_jax.train import feed
 from pewm_jax.worlds.pewm import world as pewm
@@ -197,6 +198,26 @@ def test_the_folder_is_named_by_all_that_the_clips_depend_on(tmp_path, split):
     split.sha256 = "1" * 64
     other.append(folder())
     assert len({same[0], *other}) == 1 + len(other)
+
+
+def test_how_actions_enter_the_network_does_not_change_prepared_clips(tmp_path):
+    """So that ways of conditioning share them, and clips of earlier versions are found."""
+    base = presets.load("egowm_humanoid")
+    base = dataclasses.replace(base, data=dataclasses.replace(base.data, prepared_path="clips"))
+    adapt = base.model.stages()[1]
+
+    def folder(config=base, **control):
+        return feed._folder(
+            config.with_model(control=dataclasses.replace(config.model.control, **control)),
+            adapt,
+            "weights",
+        )
+
+    assert len({folder(), folder(inject="attention"), folder(inject="channels")}) == 1
+    assert folder(body="") == folder()
+    plain = base.with_model(control=presets.load("egowm").model.control)
+    others = [folder(state=0), folder(base.with_model(observed="first")), folder(plain)]
+    assert len({folder(), *others}) == 1 + len(others)
 
 
 def test_a_training_learns_the_same_with_clips_in_memory_and_on_disk(

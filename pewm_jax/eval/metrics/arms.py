@@ -73,7 +73,8 @@ def arms_iou(found_THW: Array, true_THW: Array, smallest: float = SMALLEST) -> n
         UserError: the masks differ in shape or are not masks.
     """
     found, true = np.asarray(found_THW), np.asarray(true_THW)
-    if found.shape != true.shape or found.ndim != 3 or found.dtype != true.dtype != np.bool_:
+    masks = found.dtype == true.dtype == np.bool_
+    if found.shape != true.shape or found.ndim != 3 or not masks:
         raise UserError(
             f"masks of shapes {found.shape} and {true.shape} and types {found.dtype} and "
             f"{true.dtype} cannot be compared: give both as (T, H, W) of bool."

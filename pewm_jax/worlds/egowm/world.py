@@ -197,7 +197,8 @@ class EgoWM(AssembledModel):
         del memory
         asked = control_of(self, state.frame.camera, control)
         count = asked.camera.world_from_camera.shape[0]
-        chunked, wanted = cut_into_clips(asked, self.clip.frames - self.history)
+        length = self.clip.frames - self.history
+        chunked, wanted = cut_into_clips(asked, length, self.control.still)
         keys = jax.random.split(key, chunked.camera.world_from_camera.shape[0])
 
         def step(

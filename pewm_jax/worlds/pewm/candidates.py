@@ -31,19 +31,23 @@ from pewm_jax.worlds import world_model
 from pewm_jax.worlds.control import control_of
 
 
-def clip_control(asked: Control, here: slice, length: int) -> Control:
+def clip_control(
+    asked: Control, here: slice, length: int, still: Callable[[Array], Array]
+) -> Control:
     """Return the control of one clip of every candidate, the frames ``here`` of (K, n).
 
-    If it has less than ``length`` frames, the agent then stands still.
+    If it has less than ``length`` frames, the agent then stands still (``Conditioner.still``).
     """
     chunk = Control(jax.tree.map(lambda x: _filled(x[:, here], length), asked.camera))
     if asked.actions_TA is None:
         return chunk
-    rest = [(0, 0), (0, length - (here.stop - here.start)), (0, 0)]
-    agent = asked.state_A
+    actions, agent = asked.actions_TA[:, here], asked.state_A
+    if missing := length - (here.stop - here.start):
+        rest = jnp.repeat(still(actions[:, -1:]), missing, 1)
+        actions = jnp.concatenate([actions, rest], 1)
     if agent is not None and here.start:
         agent = asked.actions_TA[:, here.start - 1]
-    return Control(chunk.camera, jnp.pad(asked.actions_TA[:, here], rest), agent)
+    return Control(chunk.camera, actions, agent)
 
 
 def _filled(x_KT: Array, length: int) -> Array:

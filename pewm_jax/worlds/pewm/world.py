@@ -255,7 +255,7 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         """Imagine clip after clip; see ``worlds.imagine``."""
         asked = control_of(self, state.frame.camera, control)
         count = asked.camera.world_from_camera.shape[0]
-        chunked, wanted = cut_into_clips(asked, self.clip.frames - 1)
+        chunked, wanted = cut_into_clips(asked, self.clip.frames - 1, self.control.still)
         clips = chunked.camera.world_from_camera.shape[0]
 
         def step(state: WorldState, inputs: tuple[Control, Array, Array | None]) -> Any:
@@ -360,7 +360,7 @@ class PEWM(memories.MemoryEdits, AssembledModel):
                 params,
                 (present, shared),
                 state.map,
-                candidates.clip_control(asked, here, length),
+                candidates.clip_control(asked, here, length, self.control.still),
                 keys_KC[:, number],
                 shown=slice(here.stop - here.start - 1 if last else 0, here.stop - here.start),
                 memory=memory,

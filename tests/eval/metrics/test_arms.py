@@ -46,5 +46,6 @@ def test_iou_counts_frames_with_visible_arms():
     found = np.zeros_like(true)
     found[0, :, 2:6] = found[2] = True
     np.testing.assert_allclose(arms_iou(found, true), [2 / 6, 0, np.nan])
-    with pytest.raises(UserError, match="cannot be compared"):
-        arms_iou(found, true[:2])
+    for other in (true[:2], true.astype(np.uint8), true.astype(np.float32)):
+        with pytest.raises(UserError, match="cannot be compared"):
+            arms_iou(found, other)

@@ -17,7 +17,9 @@ from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import world_model
+from pewm_jax.worlds.control import cut_into_clips
 from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
+from pewm_jax.worlds.pewm import candidates
 from tests.helpers import random_camera, random_frames, randomised
 from tests.train.test_egowm import SVD
 
@@ -152,6 +154,38 @@ def test_actions_by_each_path_change_what_is_imagined(inject):
     plain = made(actions, 0.3)
     assert np.abs(plain - made(0.5 * actions, 0.3)).max() > 1e-4
     assert np.abs(plain - made(actions, -0.3)).max() > 1e-4
+
+
+def test_a_body_stands_still_where_a_clip_has_no_actions():
+    control = presets.load("egowm_humanoid").model.control
+    rng = np.random.default_rng(5)
+    cameras, actions = random_camera(rng, 3, 16, 16), rng.uniform(-0.2, 0.3, (3, 25))
+    asked = Control(cameras, jnp.asarray(actions, jnp.float32), jnp.zeros(25))
+    chunks, wanted = cut_into_clips(asked, 2, control.still)
+    np.testing.assert_array_equal(wanted, [[True, True], [True, False]])
+    held = np.append(actions[2, :-2], [0, 0])
+    np.testing.assert_allclose(chunks.actions_TA[1], [actions[2], held], atol=1e-6)
+    np.testing.assert_allclose(chunks.state_A[1], actions[1], atol=1e-6)
+    many = jax.tree.map(lambda x: jnp.asarray(x)[None], asked)
+    last = candidates.clip_control(many, slice(2, 3), 2, control.still)
+    np.testing.assert_allclose(last.actions_TA[0], [actions[2], held], atol=1e-6)
+
+
+def test_training_has_the_state_of_the_last_observed_frame(monkeypatch):
+    """As rollouts have, whose earlier states are unknown."""
+    model = dataclasses.replace(DIT, history=3, control=ModulationConfig(state=3))
+    params, clip, found = random_params(model), clip_of(model), []
+
+    def condition(model, params, observed, control, **_):
+        found.append((observed.depth_THW.shape[1], control.state_A))
+        raise InterruptedError
+
+    monkeypatch.setattr(world_model, "condition", condition)
+    with pytest.raises(InterruptedError):
+        worlds.stages(model)[1].loss(model, EgoWMTrainConfig(), params, clip, KEY)
+    ((observed, state),) = found
+    assert observed == 3
+    np.testing.assert_array_equal(state, clip.actions_TA[:, 1])
 
 
 def test_a_network_without_further_tokens_refuses_them():
