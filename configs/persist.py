@@ -81,12 +81,12 @@ def config() -> Config:
             base.train,
             run="runs/persist",
             voxel_vae=StageConfig(
-                steps=4000, batch=4, learning_rate=4e-3, warmup=50, optimizer="adam"
+                steps=3000, batch=3, learning_rate=4e-3, warmup=50, optimizer="adam"
             ),
             voxel_statistics=StageConfig(steps=60, batch=8, learning_rate=0.05, warmup=0),
-            world_frames=StageConfig(steps=4500, batch=12, learning_rate=1.5e-3, warmup=50),
+            world_frames=StageConfig(steps=4000, batch=12, learning_rate=1.5e-3, warmup=50),
             camera=StageConfig(steps=200, batch=16, learning_rate=1e-3, warmup=20),
-            renderer=StageConfig(steps=4000, batch=8, learning_rate=1.5e-3, warmup=50),
+            renderer=StageConfig(steps=3000, batch=8, learning_rate=1.5e-3, warmup=50),
             new=10.0,
             occupied=3.0,
             classes=1.0,
