@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -39,14 +40,17 @@ TRAINING, INFERENCE = "training", "inference"
 CHIPS = {TRAINING: ("h100", "v5p"), INFERENCE: ("h100", "a100", "v5e", "v6e")}
 """Chips of each table; the compilers of GPUs are faster."""
 DEVICES = 8
+MANY = (("v5p", 64, 4), ("v5e", 256, 1))
+"""Chip, number of devices and of slices: larger arrangements of the presets of ``LARGE``."""
+LARGE = ("pewm_2b", "pewm_5b")
 HEADS = {
     TRAINING: (
         *("model", "stage", "devices", "mesh", "memory of a device", "fits", "executed"),
-        *("attention", "step at best", "bound by", "MFU", "compiled in"),
+        *("attention", "step at best", "bound by", "MFU", "compiled in (CPU)"),
     ),
     INFERENCE: (
         *("model", "program", "chip", "memory", *(f"{gb} GB" for gb in inference.CARDS_GB)),
-        *("executed", "at best", "bound by", "compiled in"),
+        *("executed", "at best", "bound by", "compiled in (CPU)"),
     ),
 }
 
@@ -62,6 +66,7 @@ class Piece:
         title: its description.
         chip: the kind of device.
         devices: their number.
+        slices: the number of slices that they make up.
     """
 
     table: str
@@ -70,6 +75,7 @@ class Piece:
     title: str
     chip: Chip
     devices: int
+    slices: int = 1
 
     @property
     def config(self) -> Config:
@@ -81,19 +87,23 @@ class Piece:
         """Return the name of the result, with all that it depends on."""
         compiler = topology.compiler(self.chip)
         settings = serialize.to_dict(self.config)
-        code = inputs_hash([settings, self.name, self.chip.name, self.devices, compiler])[:16]
-        return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{self.devices}-{code}"
+        many = f"{self.devices}x{self.slices}" if self.slices > 1 else str(self.devices)
+        code = inputs_hash([settings, self.name, self.chip.name, many, compiler])[:16]
+        return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{many}-{code}"
 
     def compile(self) -> StageReport:
         """Ask the chip's compiler."""
         if self.table == TRAINING:
-            return target_compiler.compile_stage(self.config, self.name, self.chip, self.devices)
+            return target_compiler.compile_stage(
+                self.config, self.name, self.chip, self.devices, self.slices
+            )
         return target_compiler.compile_inference(self.config, self.name, self.chip)
 
 
 def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:
-    """Yield the programs of a table."""
-    for chip in map(chips.named, options.chips or CHIPS[which]):
+    """Yield the programs of a table, those for many devices last."""
+    names = options.chips or CHIPS[which]
+    for chip in map(chips.named, names):
         for preset in options.presets:
             config = presets.load(preset)
             if which == INFERENCE:
@@ -101,7 +111,14 @@ def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:
                     yield Piece(which, preset, name, inference.title(config, name), chip, 1)
                 continue
             for stage in runs.planned(config):
-                yield Piece(which, preset, stage.name, stage.title, chip, options.devices)
+                count = options.devices or DEVICES
+                yield Piece(which, preset, stage.name, stage.title, chip, count, options.slices)
+    if which == TRAINING and not options.devices:
+        wanted = [one for one in MANY if not options.chips or one[0] in options.chips]
+        for (name, devices, slices), preset in itertools.product(wanted, LARGE):
+            chip = chips.named(name)
+            for stage in runs.planned(presets.load(preset)) if preset in options.presets else ():
+                yield Piece(which, preset, stage.name, stage.title, chip, devices, slices)
 
 
 def compiled(missing: list[Piece]) -> Iterator[tuple[Piece, dict[str, Any]]]:
@@ -119,8 +136,10 @@ def compiled(missing: list[Piece]) -> Iterator[tuple[Piece, dict[str, Any]]]:
 def row(piece: Piece, found: dict[str, Any]) -> list[str]:
     """Return a line of a table."""
     head = [piece.preset, piece.title.removeprefix("stage ")]
+    apart = f" in {piece.slices} slices" if piece.slices > 1 else ""
+    where = f"{piece.devices} × {piece.chip.name}{apart}"
     if "error" in found:
-        return [*head, f"{piece.devices} × {piece.chip.name}", found["error"]]
+        return [*head, where, found["error"]]
     report = StageReport(**found)
     peak = "more" if report.peak_bytes is None else gib(report.peak_bytes)
     bound = "" if report.roofline_s is None else duration(report.roofline_s)
@@ -128,12 +147,12 @@ def row(piece: Piece, found: dict[str, Any]) -> list[str]:
     if piece.table == INFERENCE:
         cards = ["yes" if ok else "**no**" for ok in report.fits_gb.values()]
         executed = flop(report.flops_executed)
-        return [*head, piece.chip.name, peak, *cards, executed, *times, duration(report.compile_s)]
+        return [*head, piece.chip.name, peak, *cards, executed, *times, _seconds(report)]
     kernels = sorted(report.kernels.get("attention", {}))
     fits = "yes" if report.fits else "**no**"
     return [
         *head,
-        f"{report.devices} × {report.chip}",
+        where,
         arranged({name: n for name, n in report.mesh.items() if n > 1}),
         f"{peak} of {gib(report.capacity_bytes)}",
         fits,
@@ -141,8 +160,13 @@ def row(piece: Piece, found: dict[str, Any]) -> list[str]:
         _family(kernels),
         *times,
         "" if report.mfu is None else f"{report.mfu:.0%}",
-        duration(report.compile_s),
+        _seconds(report),
     ]
+
+
+def _seconds(report: StageReport) -> str:
+    """Return the time of compilation, and the processor's."""
+    return f"{duration(report.compile_s)} ({duration(report.compile_cpu_s)})"
 
 
 def _family(kernels: Sequence[str]) -> str:
@@ -161,7 +185,10 @@ def arguments(argv: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--names", nargs="+", default=(), help="stages or programs, such as clip-50"
     )
-    parser.add_argument("--devices", type=int, default=DEVICES, help="devices of a training")
+    parser.add_argument(
+        "--devices", type=int, default=0, help=f"of a training; {DEVICES} and more if not given"
+    )
+    parser.add_argument("--slices", type=int, default=1, help="with --devices: slices of them")
     parser.add_argument("--folder", type=Path, default=Path("runs/plan-table"))
     parser.add_argument("--kept", action="store_true", help="compile nothing")
     parser.add_argument("--record", action="store_true", help="rewrite docs/scaling.md")

@@ -100,7 +100,7 @@ class Clip:
               each frame, 0 for an empty cell; with ``origin_T3`` (..., T, 3) float32 world position
               of each grid's lowest corner, metres;
             * ``context_features_ShwF`` (..., S, h, w, F) cached image features of the context;
-            * ``state_A`` (..., A) the agent's own state at frame 0.
+            * ``state_A`` (..., A) the agent's own state at frame 0, such as its joints' angles.
 
             A stage's ``prepare`` adds what it computes from frozen weights, under names of its
             world (``worlds.objective.prepare``: ``latents_thwC``, ``readout`` and

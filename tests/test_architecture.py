@@ -21,6 +21,7 @@ PACKAGES = [
     "config",
     "geometry",
     "houses",
+    "bodies",
     "data",
     "nn",
     "models",

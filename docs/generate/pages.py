@@ -107,7 +107,7 @@ def glossary(root: Path = code.ROOT) -> str:
 def numbers(root: Path = code.ROOT) -> str:
     """Return the page of the recorded results."""
     parts = [NUMBERS]
-    for name in ("small", "codec"):
+    for name in ("small", "codec", "codec-2"):
         card = (root / "pewm_jax" / "shipped" / name / "README.md").read_text("utf-8")
         scores = section(card, "Scores")
         parts.append(f"## The model `{name}`\n\nFrom [its card](cards/{name}.md).\n\n{scores}")

@@ -77,13 +77,17 @@ class AssembledModel(World):
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """Context for the memory, the control's actions, and cached features of the context."""
+        """Context for the memory, what the control needs, and cached features of the context."""
         features = None
         if self.memory.encoder.WEIGHTS == "encoder":
             shape = (*self.memory.encoder.grid(self.clip), self.memory.encoder.channels)
             features = ArraySpec(shape, "float16")
         depth = self.clip.depth or self.memory.REMEMBERS
-        return BatchSpec(actions=self.control.actions, features=features, depth=depth)
+        state = self.control.state
+        extras = (("state_A", ArraySpec((state,))),) if state else ()
+        return BatchSpec(
+            actions=self.control.actions, extras=extras, features=features, depth=depth
+        )
 
     @property
     def capabilities(self) -> Capabilities:

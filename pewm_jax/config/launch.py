@@ -67,6 +67,9 @@ class Launch(Join):
     """Do not train: print what training would take on other hardware, as `pewm-jax plan` does."""
     devices: int = 8
     """Of a plan: number of devices."""
+    slices: int = 1
+    """Of a plan for TPUs with `--compiler target`: number of equal slices that make up the devices.
+    Slices are joined by the data-centre network, along the mesh axis `data`."""
     chip: str = "h200"
     """Of a plan: a100, h100, h200, b200, v4, v5e, v5p, v6e or tpu7x."""
     compiler: str = "cpu"
@@ -100,6 +103,14 @@ class Launch(Join):
         require(
             self.compiler in COMPILERS,
             f"--compiler is {self.compiler}: use {', '.join(COMPILERS)}.",
+        )
+        require(
+            self.slices >= 1 and self.devices % self.slices == 0,
+            f"--slices is {self.slices}: use a divisor of --devices {self.devices}.",
+        )
+        require(
+            self.slices == 1 or self.compiler == "target",
+            f"--slices {self.slices} describes devices for their compiler: add --compiler target.",
         )
         for name in ("fit", "inference"):
             require(

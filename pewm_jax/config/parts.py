@@ -67,6 +67,7 @@ class Backbone(Settings):
         time_dim: E, channels of the time embedding, to which a control may add.
         text_shape: (length, channels) of its text tokens; None if it takes none.
         stores_prompt: whether a prompt's embedding is stored with the weights.
+        extra_tokens: whether further tokens may follow those of the text.
         split_heads: a number that ``train.mesh.tensor`` must divide.
         remat: whether the backward pass recomputes activations.
         SHARDING: rules over ``backbone/…`` paths.
@@ -80,6 +81,7 @@ class Backbone(Settings):
     places: Any = None
     text_shape: Any = None
     stores_prompt: Any = False
+    extra_tokens: Any = False
     split_heads: Any = 1
     remat: Any = False
 

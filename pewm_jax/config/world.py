@@ -102,7 +102,8 @@ class BatchSpec:
         actions: numbers of an action that the loss needs; 0 if it needs none. Recorded actions are
             in the batch either way.
         extras: further recorded arrays by their names in ``types.Clip.extras``. The loader supports
-            ``classes_TXYZ`` and ``origin_T3``; they are absent if the data do not have them.
+            ``classes_TXYZ`` and ``origin_T3``, which are absent if the data do not have them, and
+            ``state_A``, without which data are refused.
         features: cached image features of one context frame, where ``data.features`` names a cache;
             None if the loss uses none.
         depth: whether recorded depth is needed.

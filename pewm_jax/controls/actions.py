@@ -1,10 +1,13 @@
-"""Control by actions, added to the time embedding of each latent frame (EgoWM, arXiv 2601.15284).
+"""Control by actions, by default through the time embedding (EgoWM, arXiv 2601.15284).
 
 Wherever the noise level modulates a network, frame i gets proj(e_t + e_a[i]), or, with the agent's
 state, proj(e_t + e_s + e_a[i]) (Eqs. 5 and 6): no layer of the network changes. e_a[i] depends on
 the actions that lead to the frames of latent frame i, and with convolutions on earlier actions,
 never on later ones. Observed frames have none. The last layers are zero at first, so that a model
 trained without actions is unchanged.
+
+Two other ways are there to compare with: further tokens that the network attends to, and further
+input channels (``inject``). They use the same embedding, followed by one more layer.
 
 The paper does not state the frequencies of its sinusoids: here they are geometric (``SLOWEST`` to
 ``FASTEST``) for numbers from −1 to 1.
@@ -21,22 +24,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec as P
 
+from pewm_jax.bodies.humanoid import BODIES
 from pewm_jax.config.parts import Conditioner, Rules
 from pewm_jax.controls import camera
 from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.nn.layers import linear
+from pewm_jax.nn.layers import linear, sinusoid
 from pewm_jax.types import Array, Control, Frames, Params
 
 SLOWEST, FASTEST = math.pi / 4, 8 * math.pi
 """Radians of the slowest and the fastest sinusoid for a number of 1."""
 TAPS = 3
 """Smallest kernel of a convolution, in actions."""
+CHANNELS = 16
+"""Input channels of the actions, with ``inject`` `channels`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ModulationConfig(Conditioner):
-    """Control by actions that are added to the time embedding of each latent frame (EgoWM).
+    """Control by actions, by default added to the time embedding of each latent frame (EgoWM).
 
     The defaults are the paper's for three numbers: metres forward and left in units of the data's
     waypoint spacing, and radians counter-clockwise (arXiv 2601.15284, Eqs. 5 and 6).
@@ -67,14 +73,32 @@ class ModulationConfig(Conditioner):
     state: int = 0  # type: ignore[assignment]
     """Numbers of the agent's state at the first frame, which is added to every frame (Eq. 6): as
     many as those of an action, which is then the next state; 0 for none."""
+    inject: Literal["timestep", "attention", "channels"] = "timestep"
+    """How the embeddings reach the network. `timestep`: added to the time embedding of each latent
+    frame, which modulates the layers (the paper). `attention`: as further tokens after those of the
+    text, one per latent frame, where the backbone attends to any number of tokens. `channels`:
+    repeated over height and width, as further input channels."""
+    body: Literal["", "humanoid"] = ""
+    """The body whose degrees of freedom the actions are (`data collect --body`): the viewer then
+    has a slider for each of them. Empty: the actions are of no known body."""
     rays: bool = False
     """Also concatenate the cameras' Plücker rays to the input, as the control `camera` does."""
     rate: float = 10.0  # type: ignore[assignment]
     """Factor of the learning rate of these layers, which are new in a pre-trained model."""
 
     def channels(self, model: Any) -> int:
-        """Return the rays' channels, if they are joined."""
-        return 6 * model.codec.temporal if self.rays else 0
+        """Return the channels of the rays and of the actions, if they are joined."""
+        rays = 6 * model.codec.temporal if self.rays else 0
+        return rays + CHANNELS * (self.inject == "channels")
+
+    def check(self, model: Any) -> None:
+        """Refuse a backbone that attends to no further tokens, if the actions are tokens."""
+        super().check(model)
+        require(
+            self.inject != "attention" or bool(model.backbone.extra_tokens),
+            "control.inject is attention, and this backbone attends to no further tokens: use "
+            "control.inject timestep or channels, or another backbone.",
+        )
 
     def __post_init__(self):
         """Validate."""
@@ -107,10 +131,25 @@ class ModulationConfig(Conditioner):
             self.state in (0, self.actions),
             f"control.state is {self.state}: use 0 for none, or control.actions ({self.actions}).",
         )
+        require(
+            self.inject in ("timestep", "attention", "channels"),
+            f"control.inject is {self.inject!r}: use timestep, attention or channels.",
+        )
+        require(
+            self.body in ("", *BODIES),
+            f"control.body is {self.body!r}: use {' or '.join(BODIES)}, or leave it empty.",
+        )
+        size = BODIES[self.body].size if self.body else self.actions
+        require(
+            self.actions == size,
+            f"control.actions is {self.actions}, and the body {self.body} has {size} degrees of "
+            "freedom: use that number.",
+        )
 
     def init(self, model: Any, key: Array) -> Params:
         """Return random parameters; the last layers are zero."""
         last = {"linear_2" if self.projection == "sinusoid" else "conv_2", "state_2"}
+        last = last if self.inject == "timestep" else {"inject"}
         params: Params = {}
         for number, (name, shape) in enumerate(self.layout(model).items()):
             spread = 0.0 if name in last else 1 / math.sqrt(math.prod(shape[:-1]))
@@ -121,7 +160,7 @@ class ModulationConfig(Conditioner):
     def condition(
         self, model: Any, params: Params, observed: Frames, control: Control
     ) -> Conditioning:
-        """Return the actions as modulation, and rays if ``rays`` is set.
+        """Return the actions in the form of ``inject``, and rays if ``rays`` is set.
 
         Raises:
             UserError: there are no actions, or no state although the settings need it.
@@ -146,7 +185,19 @@ class ModulationConfig(Conditioner):
             state = linear(params["state_2"], jax.nn.silu(linear(params["state_1"], state)))
             led = led + state[:, None]
         rays = camera.rays(model, control.camera) if self.rays else None
-        return Conditioning(joined_BthwC=rays, modulation_BtE=led)
+        if self.inject == "timestep":
+            return Conditioning(joined_BthwC=rays, modulation_BtE=led)
+        if self.inject == "attention":
+            return Conditioning(joined_BthwC=rays, tokens_BLC=self._tokens(params, led))
+        made = linear(params["inject"], jax.nn.silu(led))[:, :, None, None]
+        made = jnp.broadcast_to(made, (len(made), *model.latent_shape, made.shape[-1]))
+        joined = made if rays is None else jnp.concatenate([rays, made], -1)
+        return Conditioning(joined_BthwC=joined)
+
+    def _tokens(self, params: Params, led_BtE: Array) -> Array:
+        """Return a token for each latent frame, which contains the number of the frame."""
+        number = sinusoid(jnp.arange(led_BtE.shape[1]), led_BtE.shape[2])
+        return linear(params["inject"], jax.nn.silu(led_BtE + number))
 
     def embed(self, model: Any, params: Params, actions_BTA: Array) -> Array:
         """Return (B, t − 1, E) embeddings of the latent frames that (B, T − 1) actions lead to."""
@@ -185,7 +236,11 @@ class ModulationConfig(Conditioner):
             for number, step in enumerate(strides(model.codec.temporal), 1):
                 kernels[f"conv_{number}"] = (max(TAPS, step), width, width)
             state = {"state_1": (self.actions, width)}
-        return {**kernels, **({**state, "state_2": (width, width)} if self.state else {})}
+        kernels |= {**state, "state_2": (width, width)} if self.state else {}
+        if self.inject != "timestep":
+            tokens = self.inject == "attention"
+            kernels["inject"] = (width, model.backbone.text_shape[1] if tokens else CHANNELS)
+        return kernels
 
     def _waves(self, x_A: Array) -> Array:
         """Return (..., A · features) cosines and sines of numbers."""

@@ -88,10 +88,12 @@ def check_motion(episode: Episode, depth_THW: np.ndarray | None, where: str) -> 
     posed = episode.info.get("poses") != "unknown"
     if posed:
         add("actions", _check_actions(episode))
+    add("states", _check_states(episode))
     if depth_THW is None:
         return found
     add("depth", _check_units(depth_THW))
-    if not found and posed and not episode.info.get("moving"):
+    moves = episode.info.get("moving") or episode.info.get("body")
+    if not found and posed and not moves:
         # Wrong poses or units would only be reported again.
         add("depth", _check_geometry(episode, depth_THW))
     return found
@@ -232,6 +234,13 @@ def _check_poses(episode: Episode) -> Found:
         yield int(frame), f"{what}: it must be a rigid transform."
 
 
+def _check_states(episode: Episode) -> Found:
+    if episode.states is None:
+        return
+    for frame in np.flatnonzero(~np.isfinite(episode.states).all(1))[:1]:
+        yield int(frame), "contains NaN or infinity."
+
+
 def _check_actions(episode: Episode) -> Found:
     actions = episode.actions
     if actions is None:
@@ -239,8 +248,8 @@ def _check_actions(episode: Episode) -> Found:
     for frame in np.flatnonzero(~np.isfinite(actions).all(1))[:1]:
         yield int(frame), "contains NaN or infinity."
         return
-    if actions.shape[1] != PLANAR:  # for other kinds of control the motion is unknown
-        return
+    if actions.shape[1] != PLANAR or episode.info.get("handheld"):
+        return  # the motion of other controls is unknown; poses of hand-held cameras are measured
     metres, radians = action_errors(episode.world_from_camera, actions)
     for frame in np.flatnonzero((metres > ACTION_M) | (radians > ACTION_RAD))[:1]:
         what = (

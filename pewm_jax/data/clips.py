@@ -83,6 +83,7 @@ def cut(
     features: ReadFeatures | None = None,
     *,
     voxels: bool = True,
+    state: bool = False,
 ) -> Clip:
     """Decode the frames of a clip, each once, and compose its actions.
 
@@ -94,10 +95,14 @@ def cut(
         features: reads the context's features, if they are cached; slots without a frame have the
             features of the clip's first frame.
         voxels: whether the grids around the agent are read, if the episode has them.
+        state: whether the agent's state at the clip's first frame is read, ``state_A``.
 
     Returns:
         A NumPy clip without batch axis: rgb uint8, depth float32 metres, and the actions and the
         grids around the agent that the episode has.
+
+    Raises:
+        UserError: the episode has no states, and one is to be read.
     """
     wanted, place = np.unique([*choice.frames_T, *choice.context_S], return_inverse=True)
     frames = episode.frames(wanted)
@@ -114,6 +119,8 @@ def cut(
     if voxels and episode.voxel_grid is not None:
         found = episode.voxels(choice.frames_T)
         extras |= {"classes_TXYZ": found.classes_TXYZ, "origin_T3": found.origin_T3}
+    if state:
+        extras["state_A"] = state_at(episode, int(choice.frames_T[0]))
     return Clip(
         jax.tree.map(lambda x: x[place[:count]], frames),
         context,
@@ -121,6 +128,20 @@ def cut(
         None if episode.actions is None else join_actions(episode.actions, choice.frames_T),
         extras,
     )
+
+
+def state_at(episode: Episode, frame: int) -> np.ndarray:
+    """Return the (A,) float32 state of the agent at a frame.
+
+    Raises:
+        UserError: the episode has no states.
+    """
+    if episode.states is None:
+        raise UserError(
+            f"episode {episode.name} has no states of the agent, which this model needs: collect "
+            "with --body, import data that have them, or use control.state 0."
+        )
+    return episode.states[frame].astype(np.float32)
 
 
 def join_actions(actions_TA: np.ndarray, frames_T: np.ndarray) -> np.ndarray:

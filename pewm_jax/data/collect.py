@@ -53,7 +53,7 @@ DIED = (
 )
 QUIET = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 """Environment variables for Ray: no usage reports, no warning about unused GPUs."""
-PACKAGES = ("config", "geometry", "houses", "data", "io")
+PACKAGES = ("bodies", "config", "geometry", "houses", "data", "io")
 """Packages of this library whose code can change the bytes of a shard."""
 LIBRARIES = (
     "numpy",

@@ -52,6 +52,7 @@ class EpisodeArrays:
         action_ids: (T − 1,) discrete actions.
         ids_THW: instance ids from −1 (nothing) to 65534.
         voxels: the grid of class ids around the agent at each frame.
+        states: (T, S) the agent's own state at each frame, such as the angles of its joints.
     """
 
     rgb_THWC: np.ndarray
@@ -62,6 +63,7 @@ class EpisodeArrays:
     action_ids: np.ndarray | None = None
     ids_THW: np.ndarray | None = None
     voxels: VoxelFrames | None = None
+    states: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -76,6 +78,7 @@ class Episode:
         actions: (T − 1, A) float32 or None; A = 3 is (dx, dy, dyaw).
         action_ids: (T − 1,) int32 or None.
         voxel_origin_T3: float32 lowest corners of the grids around the agent, or None.
+        states: (T, S) float32 state of the agent at each frame, or None.
         info: further JSON values, e.g. ``return_frame`` of a revisit episode.
         header: the whole JSON header.
         record: the bytes.
@@ -94,6 +97,7 @@ class Episode:
     info: Mapping[str, Any]
     header: Mapping[str, Any] = dataclasses.field(repr=False)
     record: bytes = dataclasses.field(repr=False)
+    states: np.ndarray | None = None
 
     @property
     def has_depth(self) -> bool:
@@ -218,6 +222,7 @@ def write_episode(
         "actions": arrays.actions,
         "action_ids": arrays.action_ids,
         "voxel_origins": None if voxels is None else voxels.origin_T3,
+        "states": arrays.states,
     }
     header = new_header(name, scene, arrays.depth_THW.shape, info or {})
     return pack_encoded(header, small, streams, about)
@@ -299,6 +304,7 @@ def read_episode(record: bytes, where: str = "record") -> Episode:
         actions=arrays.get("actions"),
         action_ids=arrays.get("action_ids"),
         voxel_origin_T3=arrays.get("voxel_origins"),
+        states=arrays.get("states"),
         header=header,
         record=record,
     )
@@ -333,6 +339,7 @@ def _check_arrays(arrays: EpisodeArrays, name: str) -> None:
         "world_from_camera": arrays.world_from_camera,
         "actions": arrays.actions,
         "action_ids": arrays.action_ids,
+        "states": arrays.states,
     }
     for field, array in arrays_by_field.items():
         if array is not None and not shape_fits(np.shape(array), expected[field]):

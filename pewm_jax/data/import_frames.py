@@ -288,6 +288,7 @@ class RecordMaker:
             "world_from_camera": pose,
             "actions": actions,
             "voxel_origins": None if voxels is None else voxels.origin_T3,
+            "states": None if raw.states_TS is None else raw.states_TS[numbers],
         }
         looked = _for_checks(header, small, thumbs, seen.step)
         self._refuse(checks.check_motion(looked, thumbs, str(config.src)), labels)
@@ -413,6 +414,7 @@ def _for_checks(
         intrinsics_4=intrinsics.astype(np.float32),
         world_from_camera=small["world_from_camera"].astype(np.float32),
         actions=small["actions"],
+        states=small["states"],
         action_ids=None,
         voxel_origin_T3=None,
         header=header,
@@ -425,8 +427,11 @@ def _actions(
 ) -> np.ndarray | None:
     """Return recorded actions, or those of a planar motion; None if there are none.
 
-    Recorded actions of frames that are left out are joined as ``data.clips.join_actions`` does.
+    Recorded actions of frames that are left out are joined as ``data.clips.join_actions`` does;
+    where the next state is the action, it is that of the next frame that is kept.
     """
+    if raw.state_is_action and raw.states_TS is not None:
+        return raw.states_TS[numbers[1:]].astype(np.float32)
     planar = planar_actions(pose) if raw.pose_T44 is not None else None
     if raw.actions_TA is None:
         return planar

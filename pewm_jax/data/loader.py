@@ -83,7 +83,7 @@ EPOCHS = 2**31
 """Epochs of the dataset: practically endless, while its length still fits an integer."""
 
 
-RECORDED = ("classes_TXYZ", "origin_T3")
+RECORDED = ("classes_TXYZ", "origin_T3", "state_A")
 """The optional arrays of a clip that episodes may contain."""
 
 
@@ -138,7 +138,8 @@ class _DrawClip(grain.transforms.RandomMap):
         if not asked.context:
             slots, choice = 0, dataclasses.replace(choice, context_S=choice.context_S[:0])
         voxels = self.grid is not None and "classes_TXYZ" in asked.names
-        clip = cut(episode, choice, slots, self.features, voxels=voxels)
+        state = "state_A" in asked.names
+        clip = cut(episode, choice, slots, self.features, voxels=voxels, state=state)
         if not self.actions:
             clip = dataclasses.replace(clip, actions_TA=None)
         return _Drawn(record, episode.name, choice, clip)
@@ -325,13 +326,14 @@ def _check_actions(config: Config, episode: Episode) -> None:
 
 
 def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = None) -> None:
-    """Raise ConfigError if a world or a policy needs depth or poses that some episodes lack.
+    """Raise ConfigError if a world or a policy needs depth, poses or states that episodes lack.
 
     ``import`` lists which have depth; of other splits the first episode decides, or ``first``.
     """
     spec, name = task.batch_spec, type(task).__name__
     listed = source.manifest.settings.get("depth", {None: True})
-    if not (spec.depth or spec.poses):
+    state = dict(spec.extras).get("state_A")
+    if not (spec.depth or spec.poses or state):
         return
     first = source[0] if first is None else first
     assert first is not None
@@ -340,6 +342,13 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
             f"{source.path} has episodes without depth, and {name} needs it, for its memory or "
             "to generate it: import depth too, or use a world that needs none, such as egowm with "
             "--clip.depth False, or nomad."
+        )
+    found = None if first.states is None else first.states.shape[1:]
+    if state and found != state.shape:
+        has = "no states of the agent" if found is None else f"states of {found[0]} numbers"
+        raise ConfigError(
+            f"{source.path} has episodes with {has}, and control.state is {state.shape[0]}: "
+            "collect with --body, import data that have them, or use control.state 0."
         )
     if spec.poses and first.info.get("poses") == "unknown":
         raise ConfigError(

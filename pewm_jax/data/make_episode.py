@@ -12,16 +12,16 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation
 
 from pewm_jax.config import ActionConfig, ConfigError
 from pewm_jax.config.launch import is_address
+from pewm_jax.data import sensor
+from pewm_jax.data.agent import open_agent
 from pewm_jax.data.episodes import EpisodeArrays, write_episode
 from pewm_jax.data.moving import MovingHouse, moving_house, render_moving
 from pewm_jax.data.render import draw_blocks, render
 from pewm_jax.data.simulator import HEADROOM_M, open_house, open_mesh
-from pewm_jax.data.trajectories import Policy, make_trajectory
+from pewm_jax.data.trajectories import Policy, Trajectory, make_trajectory
 from pewm_jax.data.voxelise import record_voxels
 from pewm_jax.data.voxels import VoxelsConfig
 from pewm_jax.geometry.cameras import intrinsics_from_fov
@@ -35,16 +35,8 @@ HOUSES_PER_SEED = 1_000_000
 _NOT_IN_FILES = ("out", "workers", "engine", "address", "overwrite")
 """Settings that do not change the files."""
 UNRECORDED = VoxelsConfig()
-HANDHELD = 3
+HANDHELD, BODY = 3, 4
 """Number that is folded into the seed of hand-held cameras."""
-HANDHELD_HFOV = 55.0, 100.0
-"""Smallest and largest horizontal field of view of a hand-held camera, degrees."""
-HANDHELD_LOWER_M = 0.4
-"""How far, at most, a hand-held camera is below ``camera_height``, metres."""
-HANDHELD_PITCH_DEG, HANDHELD_ROLL_DEG = 12.0, 4.0
-"""Deviations of its pitch and roll, degrees."""
-HANDHELD_FRAMES = 8
-"""Frames over which its pitch and roll are correlated."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,8 +68,9 @@ class CollectConfig:
     turn_deg: float = 30.0
     """Angle of a turn, degrees (continuous actions: the largest)."""
     handheld: float = 0.0
-    """Share of the episodes of train/ that are filmed as by hand: each has its own field of view
-    (55 to 100 degrees) and height (up to 0.4 m lower), and pitch and roll that change slowly."""
+    """Share of the episodes of train/ that are filmed as by a hand-held depth camera: with a field
+    of view and height of their own, pitch and roll that change slowly, and the errors of such a
+    recording in colour, depth and poses (`data/sensor.py` lists them with their sizes)."""
     turn_around: float = 0.5
     """Probability of a full turn at the start of an episode; revisit episodes always have it."""
     policy: Literal["follow", "walk"] = "follow"
@@ -92,6 +85,10 @@ class CollectConfig:
     """Also write instance ids, and the names of the instances."""
     moving: bool = False
     """Generated houses have doors that open as the agent approaches, and patrolling robots."""
+    body: Literal["", "humanoid"] = ""
+    """Body of the agent: `humanoid` has 25 degrees of freedom, of which two are walking. It is seen
+    by the camera on its head, which is camera_height above the floor when it stands upright. It
+    pauses and moves its arms; actions are the angles of its joints at the next frame."""
     voxels: VoxelsConfig = UNRECORDED
     episodes_per_house: int = 1
     """Episodes recorded in one house before the next is generated."""
@@ -127,14 +124,11 @@ class CollectConfig:
             raise ConfigError(f"a split can hold at most {HOUSES_PER_SEED} episodes.")
         if self.train + self.validation + self.test == 0:
             raise ConfigError("--train, --validation and --test are all 0: nothing to collect.")
-        if not 0 <= self.turn_around <= 1:
-            raise ConfigError(f"--turn-around is {self.turn_around}: use a probability, 0 to 1.")
-        if not 0 <= self.handheld <= 1:
-            raise ConfigError(f"--handheld is {self.handheld}: use a share of episodes, 0 to 1.")
         if not 1 <= self.hfov < 180:
             raise ConfigError(f"--hfov is {self.hfov}: use 1 up to below 180 degrees.")
         if self.frames < 2:
             raise ConfigError("--frames is 1: an episode needs at least 2 frames.")
+        self._check_probabilities()
         self._check_moving_and_voxels()
         if self.address and self.engine != "ray":
             raise ConfigError(f"--address {self.address} needs --engine ray.")
@@ -142,6 +136,13 @@ class CollectConfig:
             raise ConfigError(
                 f"--address is {self.address!r}: use HOST:PORT (a port from 1 to 65535) or auto."
             )
+
+    def _check_probabilities(self) -> None:
+        for name in ("turn_around", "handheld"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(
+                    f"--{dashed(name)} is {getattr(self, name)}: use a probability, 0 to 1."
+                )
 
     def _check_moving_and_voxels(self) -> None:
         if self.moving and self.scene:
@@ -154,6 +155,7 @@ class CollectConfig:
                 f"--camera-height is {self.camera_height}: with --moving use "
                 f"{ROBOT_HEIGHT_M + HEADROOM_M:g} m or more, to be above the robots."
             )
+        self._check_body()
         for field in () if self.voxels.record else dataclasses.fields(self.voxels):
             value = getattr(self.voxels, field.name)
             if value != field.default:
@@ -163,6 +165,18 @@ class CollectConfig:
                 "--ids records the instances of the house, which --voxels.pictures cells does not "
                 "show: leave out one of the two."
             )
+
+    def _check_body(self) -> None:
+        for flag, given in (
+            ("continuous", self.continuous),
+            ("handheld", self.handheld > 0),
+            ("voxels", self.voxels.record),
+        ):
+            if self.body and given:
+                raise ConfigError(
+                    f"--{flag} does not go together with --body {self.body}: leave out one of the "
+                    "two."
+                )
 
     @property
     def actions(self) -> ActionConfig:
@@ -184,8 +198,9 @@ def settings_of(config: CollectConfig, split: str) -> dict[str, Any]:
         del settings["test_policy"]
     if split != "train" or not config.handheld:
         del settings["handheld"]
-    if not config.moving:
-        del settings["moving"]
+    for name in ("moving", "body"):
+        if not getattr(config, name):
+            del settings[name]
     if settings["voxels"]["pictures"] == UNRECORDED.pictures:
         del settings["voxels"]["pictures"]
     if not settings["voxels"].pop("record"):
@@ -225,28 +240,25 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
     else:
         scene, grid = _house(house_seed(config, split, index), config.camera_height)
     policy: Policy = config.test_policy if split == "revisit" else config.policy
+    agent = open_agent(config.body, config.camera_height) if config.body else None
     walk = make_trajectory(
         grid,
         config.actions,
-        config.frames,
+        config.frames if agent is None else agent.frames(config.frames),
         np.random.default_rng([config.seed, SPLITS.index(split), index]),
         policy=policy,
         turn_around=config.turn_around,
         continuous=config.continuous,
     )
     size = config.size, config.size
-    hfov, height = config.hfov, config.camera_height
-    tilt_T33 = None
-    if split == "train" and config.handheld:
-        rng = np.random.default_rng([config.seed, SPLITS.index(split), index, HANDHELD])
-        if rng.random() < config.handheld:
-            hfov = rng.uniform(*HANDHELD_HFOV)
-            height -= rng.uniform(0, min(HANDHELD_LOWER_M, height / 2))
-            tilt_T33 = _tilts(rng, config.frames)
-    pose = walk.world_from_camera(grid.floor_z + height)
-    if tilt_T33 is not None:
-        pose[:, :3, :3] = pose[:, :3, :3] @ tilt_T33
-    camera = Camera(intrinsics_from_fov(*size, hfov), pose)
+    by_hand = _hand(config, split, index)
+    camera, height = _filmed(config, walk, grid.floor_z, by_hand)
+    states = None
+    if agent is not None:
+        rng = np.random.default_rng([config.seed, SPLITS.index(split), index, BODY])
+        walk, states = agent.act(walk, config.frames, rng)
+        camera = agent.camera(walk.planar_T3, states, camera.intrinsics_4, grid.floor_z)
+    pose = np.asarray(camera.world_from_camera)
     parts = None if moving is None else moving.poses(walk.planar_T3[:, :2])
     voxels = None
     if config.voxels.record:
@@ -258,15 +270,22 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         seen = render_moving(moving, parts, camera, *size)
     else:
         seen = render(scene, camera, *size)
+    bodies = None
+    if agent is not None and states is not None:
+        first = len(scene.objects) + (0 if moving is None else len(moving.moves))
+        agent.render_over(seen, walk.planar_T3, states, camera, grid.floor_z, first)
+        bodies = {"name": config.body, "scale": round(agent.scale, 6), "ids": agent.ids(first)}
+    recorded = sensor.record(by_hand, seen.rgb_THWC, seen.depth_THW, pose)
     arrays = EpisodeArrays(
-        seen.rgb_THWC,
-        seen.depth_THW,
+        recorded.rgb_THWC,
+        recorded.depth_THW,
         camera.intrinsics_4,
-        pose,
+        recorded.pose_T44,
         walk.actions,
         walk.action_ids,
         seen.ids_THW if config.ids else None,
         voxels,
+        states,
     )
     info: dict[str, Any] = {
         "policy": policy,
@@ -275,25 +294,43 @@ def make_episode(config: CollectConfig, split: str, index: int) -> bytes:
         "step_m": config.step_m,
         "turn_deg": config.turn_deg,
     }
-    if config.ids:
-        info["objects"] = list(scene.objects)
-    if config.moving:
-        info["moving"] = True
-    if config.voxels.pictures != UNRECORDED.pictures:
-        info["pictures"] = config.voxels.pictures
-    if walk.return_frame is not None:
-        info["return_frame"] = walk.return_frame
+    optional = {
+        "objects": list(scene.objects) if config.ids else None,
+        "moving": config.moving or None,
+        "body": bodies,
+        "handheld": by_hand is not None or None,
+        "pictures": None if _usual_pictures(config) else config.voxels.pictures,
+        "return_frame": walk.return_frame,
+    }
+    info |= {name: value for name, value in optional.items() if value is not None}
     return write_episode(arrays, f"{split}-{index:06d}", scene.name, info)
 
 
-def _tilts(rng: np.random.Generator, frames: int) -> np.ndarray:
-    """Return rotations (T, 3, 3) of a camera about its own x axis (pitch) and z axis (roll)."""
-    noise = rng.normal(size=(frames + 4 * HANDHELD_FRAMES, 2))
-    smooth = gaussian_filter1d(noise, HANDHELD_FRAMES, axis=0)[2 * HANDHELD_FRAMES :][:frames]
-    unit = smooth * np.sqrt(2 * HANDHELD_FRAMES * np.sqrt(np.pi))  # deviation 1
-    angles_T2 = unit * (HANDHELD_PITCH_DEG, HANDHELD_ROLL_DEG)
-    turns = Rotation.from_euler("xz", angles_T2, degrees=True)
-    return turns.as_matrix().astype(np.float32)
+def _usual_pictures(config: CollectConfig) -> bool:
+    return config.voxels.pictures == UNRECORDED.pictures
+
+
+def _hand(config: CollectConfig, split: str, index: int) -> np.random.Generator | None:
+    """Return what the errors of a hand-held camera depend on; None for the robot's camera."""
+    rng = np.random.default_rng([config.seed, SPLITS.index(split), index, HANDHELD])
+    return rng if split == "train" and rng.random() < config.handheld else None
+
+
+def _filmed(
+    config: CollectConfig, walk: Trajectory, floor_z: float, rng: np.random.Generator | None
+) -> tuple[Camera, float]:
+    """Return the (T,) cameras of a walk, and their height above the floor, metres.
+
+    ``rng`` is that of a hand-held camera, None for the robot's.
+    """
+    hfov, height = config.hfov, config.camera_height
+    if rng is not None:
+        hfov = rng.uniform(*sensor.HFOV_DEG)
+        height -= rng.uniform(0, min(sensor.LOWER_M, height / 2))
+    pose = walk.world_from_camera(floor_z + height)
+    if rng is not None:
+        pose[:, :3, :3] = pose[:, :3, :3] @ sensor.tilts(rng, config.frames)
+    return Camera(intrinsics_from_fov(config.size, config.size, hfov), pose), height
 
 
 _house = functools.lru_cache(maxsize=1)(open_house)

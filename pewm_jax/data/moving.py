@@ -15,11 +15,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import trimesh
 
 from pewm_jax.data.navigation import NavGrid, navigable, shortest_path
+from pewm_jax.data.parts import make_parts, place_parts, render_over
 from pewm_jax.data.render import Rendered, render
-from pewm_jax.data.scenes import Scene, from_trimesh, house
+from pewm_jax.data.scenes import Scene, house
 from pewm_jax.houses.fixtures import LEAF_M, ROBOT_RADIUS_M, door_leaf, robot
 from pewm_jax.houses.floorplan import largest_region
 from pewm_jax.houses.shapes import Piece
@@ -34,8 +34,6 @@ ROBOT_STEP_M = 0.12
 """Metres that a robot moves from frame to frame."""
 ROBOT_DISTANCE_M = 1.4
 """Distance that robots keep from doorways, where leaves swing, metres."""
-_APART_M = 20.0
-"""Distance between parts while their light is baked, so that none occludes another, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,20 +99,20 @@ def moving_house(seed: int, agent_height_m: float) -> MovingHouse:
         leaves, width, free = hang_leaves(scene, free, draw, (x0, y0, x1, y1))
         moves += leaves
         pieces += [door_leaf(draw, width)] * len(leaves)
-    opened = _place_parts(_parts(pieces), _open_poses(moves)) if moves else None
+    opened = place_parts(make_parts(pieces), _open_poses(moves)) if moves else None
     grid = navigable(_concatenate(scene, opened), agent_height_m=agent_height_m)
     for room in scene.metadata["rooms"]:
         way = _robot_path(grid, rng, room, scene.metadata["doorways"])
         if way is not None:
             moves.append(way)
             pieces.append(robot(rng))
-    return MovingHouse(scene, grid, tuple(moves), _parts(pieces) if pieces else None)
+    return MovingHouse(scene, grid, tuple(moves), make_parts(pieces) if pieces else None)
 
 
 def parts_at(moving: MovingHouse, world_from_part_P44: np.ndarray) -> Scene:
     """Return the parts alone as a scene, at their poses of one frame."""
     assert moving.parts is not None
-    return _place_parts(moving.parts, world_from_part_P44)
+    return place_parts(moving.parts, world_from_part_P44)
 
 
 def part_at(moving: MovingHouse, number: int, world_from_part_44: np.ndarray) -> Scene:
@@ -137,16 +135,7 @@ def render_moving(
     seen = render(moving.scene, camera, height, width)
     if moving.parts is None:
         return seen
-    pose = np.asarray(camera.world_from_camera)
-    intrinsics = np.broadcast_to(np.asarray(camera.intrinsics_4), (len(pose), 4))
-    for t in range(len(pose)):
-        one = Camera(intrinsics[t : t + 1], pose[t : t + 1])
-        over = render(parts_at(moving, poses_TP44[t]), one, height, width)
-        depth, behind = over.depth_THW[0], seen.depth_THW[t]
-        nearer = (over.ids_THW[0] >= 0) & ((behind <= 0) | (depth < behind))
-        seen.rgb_THWC[t][nearer] = over.rgb_THWC[0][nearer]
-        seen.depth_THW[t][nearer] = depth[nearer]
-        seen.ids_THW[t][nearer] = over.ids_THW[0][nearer] + len(moving.scene.objects)
+    render_over(seen, moving.parts, poses_TP44, camera, len(moving.scene.objects))
     return seen
 
 
@@ -194,39 +183,6 @@ def _robot_path(
             if length > 6 * ROBOT_RADIUS_M:
                 return RobotPath(closed, float(draw.uniform(0, length)))
     return None
-
-
-def _parts(pieces: list[Piece]) -> Scene:
-    """Return pieces as one scene, each lit alone and in its own frame."""
-    scene = trimesh.Scene(metadata={"shading": "soft"})
-    for number, piece in enumerate(pieces):
-        apart = np.eye(4)
-        apart[0, 3] = _APART_M * number
-        solid = piece.solid()
-        assert solid is not None
-        scene.add_geometry(solid, node_name=f"{piece.kind}{number}", transform=apart)
-    made = from_trimesh(scene, "parts")
-    assert list(made.objects) == [f"{piece.kind}{k}" for k, piece in enumerate(pieces)]
-    part_V = _part_of_vertex(made)
-    vertices = made.vertices_V3.copy()
-    vertices[:, 0] -= _APART_M * part_V
-    return dataclasses.replace(made, vertices_V3=vertices)
-
-
-def _place_parts(parts: Scene, world_from_part_P44: np.ndarray) -> Scene:
-    """Move every part of a scene to its pose."""
-    pose = world_from_part_P44[_part_of_vertex(parts)]
-    vertices = np.einsum("vij,vj->vi", pose[:, :3, :3], parts.vertices_V3) + pose[:, :3, 3]
-    turn = world_from_part_P44[parts.object_F, :3, :3]
-    normals = np.einsum("fij,fj->fi", turn, parts.normals_F3)
-    return dataclasses.replace(parts, vertices_V3=vertices, normals_F3=normals)
-
-
-def _part_of_vertex(parts: Scene) -> np.ndarray:
-    """Return (V,) the part that each vertex belongs to."""
-    part_V = np.zeros(len(parts.vertices_V3), np.int64)
-    part_V[parts.faces_F3.ravel()] = np.repeat(parts.object_F, 3)
-    return part_V
 
 
 NEAR_M, FAR_M = 1.3, 2.4

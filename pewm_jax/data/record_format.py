@@ -67,6 +67,7 @@ def array_shapes(frames: int) -> dict[str, tuple[int | str, ...]]:
         "world_from_camera": (frames, 4, 4),
         "actions": (frames - 1, "A"),
         "action_ids": (frames - 1,),
+        "states": (frames, "S"),
         "voxel_origins": (frames, 3),
     }
 

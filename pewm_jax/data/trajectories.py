@@ -38,7 +38,7 @@ class Trajectory:
 
     Attributes:
         planar_T3: float64 x, y, yaw in the world, metres and radians.
-        actions: (T − 1, 3) float64 dx, dy, dyaw.
+        actions: (T − 1, 3) float64 dx, dy, dyaw; or (T − 1, A) states of an articulated agent.
         action_ids: (T − 1,) int32, or None for continuous actions.
         return_frame: the frame at which a revisit trajectory turns back, or None.
     """

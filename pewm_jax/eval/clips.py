@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from pewm_jax.config import Config, UserError, World, to_dict
-from pewm_jax.data.clips import choose_context, join_actions
+from pewm_jax.data.clips import choose_context, join_actions, state_at
 from pewm_jax.data.episodes import Episode
 from pewm_jax.geometry.actions import PLANAR, actions_between, continuous, integrate
 from pewm_jax.types import Array, Camera, Control, Frames
@@ -151,10 +151,11 @@ def steered_by_record(model: World) -> bool:
 def recorded_control(model: World, episode: Episode, frames: Sequence[int]) -> Control:
     """Return the recorded control that leads from the first frame through the N others.
 
-    It has (N,) cameras and (N, A) actions, composed as in training; frames are evenly spaced.
+    It has (N,) cameras, (N, A) actions, composed as in training, and the state at the first frame
+    if the model needs it; frames are evenly spaced.
 
     Raises:
-        UserError: the episode has no actions, or of another number than the model's.
+        UserError: the episode has no actions or no states, or of another number than the model's.
     """
     wanted = model.batch_spec.actions
     if episode.actions is None:
@@ -171,7 +172,21 @@ def recorded_control(model: World, episode: Episode, frames: Sequence[int]) -> C
             f"model is steered by {wanted}: use the data and the stride (evaluate.stride) that it "
             "was trained with."
         )
-    return Control(episode.camera(np.asarray(frames[1:])), actions)
+    needs_state = "state_A" in model.batch_spec.names
+    state = state_at(episode, int(frames[0])) if needs_state else None
+    return Control(episode.camera(np.asarray(frames[1:])), actions, state)
+
+
+def later_control(control: Control, at: int, count: int) -> Control:
+    """Return ``count`` frames of the control of a batch of clips, from frame ``at`` on.
+
+    The state of the agent there is the action that leads to the frame before (Eq. 6 of EgoWM).
+    """
+    actions, state = control.actions_TA, control.state_A
+    if state is not None and actions is not None and at:
+        state = actions[:, at - 1]
+    camera = jax.tree.map(lambda x: x[:, at : at + count], control.camera)
+    return Control(camera, None if actions is None else actions[:, at : at + count], state)
 
 
 def has_geometry(episode: Episode) -> bool:

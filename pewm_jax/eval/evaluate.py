@@ -43,7 +43,7 @@ from pewm_jax.train import processes
 
 TRAINED_ON = "train"
 """The training split."""
-REPORT_VERSION = 12
+REPORT_VERSION = 13
 """Increase it whenever the same scores would give a different report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -266,8 +266,11 @@ def _measure(
     if methods.remembers and config.model.capabilities.coverage:
         covered = score_coverage(config, episodes, methods.model, cache, log, clips)
     if not methods.model.cameras:
-        params = job.loaded.params
-        steered, about_steering = steering.score(config, params, episodes, clips, cache, log)
+        arms = bool(config.model.batch_spec.actions) and steering.shows_arms(episodes)
+        measures = steering.Measures(metrics.lpips, metrics.structure, arms)
+        steered, about_steering = steering.score(
+            config, job.loaded.params, episodes, clips, cache, log, measures
+        )
     voxels = voxel_report.score(config, job.loaded.params, episodes, cache, log, metrics.i3d)
     about = {"mirror": way_out(config, rollouts)[1], "steering": about_steering}
     return _Measured(scored, long, mirrored, covered, steered, voxels, about)

@@ -28,7 +28,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import abstract
-from pewm_jax.eval.clips import steered_by_record
+from pewm_jax.eval.clips import later_control, steered_by_record
 from pewm_jax.eval.reproject import ReprojectSettings, reproject_batch
 from pewm_jax.io.store import Workers
 from pewm_jax.report.labels import OWN_METHODS
@@ -102,8 +102,11 @@ class ModelRunner:
         steps = f"{steps} steps, " if steps else ""
         control = abstract.array(self.batch, length, 3)
         if steered_by_record(self.config.model):
-            actions = abstract.array(self.batch, length, self.config.model.batch_spec.actions)
-            control = Control(abstract.camera(self.batch, length), actions)
+            spec = self.config.model.batch_spec
+            actions = abstract.array(self.batch, length, spec.actions)
+            state = dict(spec.extras).get("state_A")
+            before = None if state is None else abstract.array(self.batch, *state.shape)
+            control = Control(abstract.camera(self.batch, length), actions, before)
         elif self.cameras:
             control = abstract.camera(self.batch, length)
         keys = jax.eval_shape(clip_keys, jax.ShapeDtypeStruct((self.batch, 2), jnp.uint32))
@@ -162,7 +165,10 @@ class ModelRunner:
         control = jax.tree.map(jnp.asarray, control)
         count = jax.tree.leaves(control)[0].shape[1]
         for first_frame in range(0, count, per_clip):
-            part = jax.tree.map(lambda x, at=first_frame: x[:, at : at + per_clip], control)
+            if isinstance(control, Control):
+                part = later_control(control, first_frame, per_clip)
+            else:
+                part = jax.tree.map(lambda x, at=first_frame: x[:, at : at + per_clip], control)
             now = jax.vmap(jax.random.fold_in, (0, None))(keys, first_frame // per_clip)
             state, frames = self._clip[memory](params, state, self._put(part), self._put(now))
             if watch is not None:

@@ -191,16 +191,26 @@ def load_batch(
         depth = np.where(known_B[:, None, None, None], targets.depth_THW, 0)
         surfaces = dataclasses.replace(targets, depth_THW=depth)
     seen, unseen = seen_masks_batch(surfaces, context)
-    tracked = tuple(_tracked(episodes[one.episode], one) for one in choices) if track else ()
+    tracked = tuple(tracked_of(episodes[one.episode], one) for one in choices) if track else ()
     numbers, real = first + np.arange(size), len(choices)
     return Batch(context, targets, control, numbers, seen, unseen, real=real, tracked=tracked)
 
 
-def _tracked(episode: Episode, choice: ClipChoice) -> Tracked:
+def tracked_of(episode: Episode, choice: ClipChoice) -> Tracked:
+    """Return the ground truth of a clip for SCS.
+
+    Parts that move by themselves, such as doors and arms, have no depth there: whether a frame
+    still shows a point of the present one is decided by what stands still.
+
+    Raises:
+        UserError: the episode has no instance ids.
+    """
     frames = [choice.start, *choice.targets_N]
-    clip = episode.frames(frames)
-    visible_T = first_visible(np.asarray(clip.depth_THW), clip.camera)
-    return Tracked(episode.ids(frames), object_ids(episode.info), visible_T)
+    clip, ids = episode.frames(frames), episode.ids(frames)
+    names = episode.info.get("objects")
+    depth = np.where(ids >= len(names), 0, clip.depth_THW) if names else clip.depth_THW
+    visible_T = first_visible(np.asarray(depth), clip.camera)
+    return Tracked(ids, object_ids(episode.info), visible_T)
 
 
 SUMS_PIECE = "table2"

@@ -1,20 +1,19 @@
-"""Measure whether actions steer a world: imagine walks with true, shuffled and no actions.
+"""Measure whether actions steer a world: imagine clips with true, shuffled and no actions.
 
 A world that follows its actions is closest to the ground truth with the true ones. *Shuffled*
 actions are those of a clip in another house. *None* are zero embeddings, as observed frames have:
-available only for models whose control uses modulation. *Copy* is a baseline without a network that
-repeats the observed frame.
+available only for models whose control can be zeroed. *Copy* is a baseline without a network that
+repeats the observed frame. ``walks`` chooses the clips.
 
-The measurement needs clips that can show a difference (``Walks``). In every clip at least half of
-the steps go forward, because a turn in place replaces the whole view after a few frames, whatever
-the actions are. The shuffled actions differ from the true ones in at least half of the steps.
+Every kind of actions is scored by the squared error of colours and, where they can be measured, by
+LPIPS, by SCS with exact masks of the true clip, and by the IoU of the agent's arms with the truth.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -22,190 +21,85 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.config import ActionConfig, Config, UserError
+from pewm_jax.bodies.humanoid import arm_ids
+from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import statistics
-from pewm_jax.eval.clips import (
-    ClipChoice,
-    choice_of,
-    load_clip,
-    return_start,
-    stack,
-    steered_by_record,
-)
+from pewm_jax.eval.clips import ClipChoice, load_clip, stack
+from pewm_jax.eval.metrics.arms import arms_by_colour, arms_iou
 from pewm_jax.eval.metrics.images import psnr, unit_colours
+from pewm_jax.eval.metrics.perceptual import LPIPS
+from pewm_jax.eval.metrics.structure import Consistency, average
 from pewm_jax.eval.runner import workers
-from pewm_jax.geometry.actions import actions_between
+from pewm_jax.eval.scoring import Tracked, tracked_of
+from pewm_jax.eval.walks import Walks, choose_walks
 from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import ResultCache, map_resumable
-from pewm_jax.types import Array, Frames, Params
+from pewm_jax.types import Array, Control, Frames, Params
 
-TRUE, SHUFFLED, NONE, COPY = "true", "shuffled", "none", "copy"
-LEAST_FORWARD = 0.5
-"""Smallest share of a clip's steps that go forward."""
-LEAST_DIFFERENT = 0.5
-"""Smallest share of a clip's steps in which the shuffled actions differ from the true ones."""
-MOVED = 0.1
-"""Forward motion, in steps of ``ActionConfig.step_m``, up to which the agent counts as standing
-still."""
-APART = 0.5
-"""Smallest difference between two motions that counts, in units of a step or a turn."""
+TRUE, SHUFFLED, NONE, COPY, TRUTH = "true", "shuffled", "none", "copy", "truth"
+"""Kinds of actions; ``truth`` is the true clip, the ceiling of scores that need a segmentation."""
+SMALLER = ("lpips",)
+"""Scores of which smaller values are better."""
+SCORES = ("lpips", "scs", "arms")
+"""The scores beside PSNR, in the order of reports."""
+AT = (4, 8, 16)
+"""Imagined frames at which the paper's tables have scores."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Walks:
-    """Clips that are walks, each with a clip of another house that has different actions.
+class Measures:
+    """What is measured beside the error of colours; None and False for what is not."""
 
-    ``forward_C`` is the share of each clip's steps that go forward, ``different_C`` the share in
-    which the shuffled actions, of ``others``, differ from the true ones.
-
-    Raises:
-        ValueError: a share is below its limit, or both clips of a pair are from one house.
-    """
-
-    choices: list[ClipChoice]
-    others: list[ClipChoice]
-    forward_C: np.ndarray
-    different_C: np.ndarray
-
-    def __post_init__(self):
-        """Check the properties on which the measurement relies."""
-        pairs = zip(self.choices, self.others, strict=True)
-        if any(one.scene == other.scene for one, other in pairs):
-            raise ValueError("the shuffled actions of a clip come from its own house")
-        if np.any(self.forward_C < LEAST_FORWARD):
-            raise ValueError(f"a clip with {self.forward_C.min():.0%} forward steps is not a walk")
-        if np.any(self.different_C < LEAST_DIFFERENT):
-            raise ValueError(
-                f"shuffled actions differ in {self.different_C.min():.0%} of the steps"
-            )
+    lpips: LPIPS | None = None
+    structure: Consistency | None = None
+    arms: bool = False
 
     @property
-    def houses(self) -> np.ndarray:
-        """Return the (C,) index of each clip's house."""
-        return np.unique([choice.scene for choice in self.choices], return_inverse=True)[1]
+    def names(self) -> dict[str, str]:
+        """Return the headings of the scores that are measured."""
+        found = {}
+        if self.lpips is not None:
+            found["lpips"] = f"LPIPS[{self.lpips.encoder}]"
+        if self.structure is not None:
+            found["scs"] = self.structure.name
+        if self.arms:
+            found["arms"] = "IoU of the arms"
+        return found
 
     @property
-    def about(self) -> str:
-        """Return a description of the clips."""
-        return (
-            f"{len(self.choices)} walks in {len(set(self.houses))} houses: "
-            f"{100 * self.forward_C.mean():.1f} % of the steps go forward (in each clip at least "
-            f"{100 * self.forward_C.min():.0f} %); the other actions differ in "
-            f"{100 * self.different_C.mean():.1f} % of the steps (in each clip at least "
-            f"{100 * self.different_C.min():.0f} %)"
-        )
+    def key(self) -> str:
+        """Return a text of all that the scores depend on beside the clips, for file names."""
+        parts = ["arms"] * self.arms
+        if self.lpips is not None:
+            parts.append(f"lpips-{self.lpips.sha256[:16]}")
+        if self.structure is not None:
+            parts += ["scs", self.structure.encoder, self.structure.sha256[:16]]
+        return "-".join(filter(None, parts)) or "colours"
 
 
-def forward_steps(actions: ActionConfig, motion_N3: np.ndarray) -> np.ndarray:
-    """Return (...) bool: whether steps (..., 3) dx, dy, dyaw, metres and radians, go forward.
-
-    A step goes forward if the agent moves ahead by more than it turns, in units of a forward step
-    and of a turn. So a discrete forward action does, and a discrete turn does not.
-    """
-    motion = np.asarray(motion_N3)
-    ahead = motion[..., 0] / actions.step_m
-    turned = np.abs(motion[..., 2]) / math.radians(actions.turn_deg)
-    return ahead > np.maximum(turned, MOVED)
-
-
-def different_steps(actions: ActionConfig, one_N3: np.ndarray, two_N3: np.ndarray) -> np.ndarray:
-    """Return (...) bool: whether two motions differ, by half of a step or half of a turn."""
-    apart = np.abs(np.asarray(one_N3) - np.asarray(two_N3))
-    turned = np.minimum(apart[..., 2], 2 * math.pi - apart[..., 2]) / math.radians(actions.turn_deg)
-    return np.maximum(apart[..., :2].max(-1) / actions.step_m, turned) >= APART
-
-
-def choose_walks(
-    config: Config,
-    episodes: Sequence[Episode],
-    clips: int,
-    chain: int = 1,
-    among: Iterable[int] | None = None,
-) -> Walks:
-    """Choose clips that are walks, and the clips that provide the shuffled actions.
-
-    Starts are spread evenly over the walks on the return path of every episode, where reports take
-    their clips too: the first walk of every episode, then the second ones, and so on. The shuffled
-    actions are drawn, with a fixed seed, from all clips on the return paths in other houses that
-    differ in ``LEAST_DIFFERENT`` of the steps; these need not be walks. ``among`` are the indices
-    of the episodes to choose from; by default all.
-
-    Raises:
-        UserError: no episode is long enough, none has a walk, or no other house has different
-            actions.
-    """
-    units, stride = config.model.actions, config.evaluate.stride
-    count = chain * (config.model.clip.frames - 1)
-    where = f"{config.data.path}/{config.evaluate.split}"
-    indices = sorted(set(range(len(episodes)) if among is None else among))
-    per_episode = -(-clips // max(len(indices), 1))
-    pool: list[ClipChoice] = []
-    motions: list[np.ndarray] = []
-    ranked: list[tuple[int, int]] = []
-    for index in indices:
-        episode = episodes[index]
-        last = episode.length - 1 - count * stride
-        if last < 0:
-            continue
-        starts = np.arange(min(return_start(episode), last), last + 1)
-        steps_SN = starts[:, None] + stride * np.arange(count)
-        motion_SN3 = _motion(episode.world_from_camera, stride)[steps_SN]
-        walking = np.flatnonzero(forward_steps(units, motion_SN3).mean(1) >= LEAST_FORWARD)
-        if walking.size:
-            spread = np.linspace(0, len(walking) - 1, per_episode)
-            for rank, at in enumerate(np.unique(np.round(spread).astype(int))):
-                ranked.append((rank, len(pool) + int(walking[at])))
-        pool += [choice_of(config, episode, index, int(start), count) for start in starts]
-        motions.append(motion_SN3)
-    if not pool:
-        raise UserError(
-            f"no episode of {where} is long enough for {count * stride + 1} frames: collect longer "
-            "ones."
-        )
-    if not ranked:
-        raise UserError(
-            f"no clip of {where} is a walk: in each of them fewer than half of the steps go "
-            "forward; collect walks with --test_policy follow, or evaluate another split "
-            "(evaluate.split)."
-        )
-    motion_PN3 = np.concatenate(motions)
-    scenes = np.array([choice.scene for choice in pool])
-    chosen, others, different = [], [], []
-    for _, place in sorted(ranked):
-        share_P = different_steps(units, motion_PN3, motion_PN3[place]).mean(1)
-        able = np.flatnonzero((scenes != scenes[place]) & (share_P >= LEAST_DIFFERENT))
-        if able.size and len(chosen) < clips:
-            other = int(np.random.default_rng([0, place]).choice(able))
-            chosen.append(place)
-            others.append(other)
-            different.append(share_P[other])
-    if not chosen:
-        raise UserError(
-            f"no clip of {where} has a partner with different actions: it must be from another "
-            "house and differ in at least half of the steps; evaluate a split with several houses "
-            "(evaluate.split)."
-        )
-    return Walks(
-        [pool[place] for place in chosen],
-        [pool[other] for other in others],
-        forward_steps(units, motion_PN3[chosen]).mean(1),
-        np.array(different),
-    )
-
-
-def _motion(world_from_camera: np.ndarray, stride: int) -> np.ndarray:
-    """Return (T - stride, 3) the planar motion from each frame to the one ``stride`` later."""
-    pairs = np.stack([world_from_camera[:-stride], world_from_camera[stride:]], 1)
-    return np.asarray(jax.vmap(actions_between)(pairs))[:, 0]
+def shows_arms(episodes: Sequence[Episode]) -> bool:
+    """Return whether all episodes have the instance ids of an agent's arms."""
+    found = [episodes[k] for k in range(len(episodes))]
+    return bool(found) and all(one.has_ids and arm_ids(one.info) for one in found)
 
 
 @dataclasses.dataclass(frozen=True)
 class Steered:
-    """The results: kind of actions → (C, N) mean squared colour errors of each imagined frame."""
+    """The results.
+
+    Attributes:
+        errors: kind of actions → (C, N) mean squared colour errors of each imagined frame.
+        walks: the clips.
+        scores: name in ``SCORES`` → kind → (C, 1 + N): of the whole clip, then of each frame; NaN
+            where there is none.
+        names: name in ``SCORES`` → heading.
+    """
 
     errors: Mapping[str, np.ndarray]
     walks: Walks
+    scores: Mapping[str, Mapping[str, np.ndarray]] = dataclasses.field(default_factory=dict)
+    names: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     @property
     def psnr(self) -> dict[str, np.ndarray]:
@@ -226,37 +120,71 @@ class Steered:
             "clips": len(self.walks.choices),
             "forward": float(self.walks.forward_C.mean()),
             "different": float(self.walks.different_C.mean()),
+            "recorded": self.walks.recorded,
             "all": self.table(),
             "per_frame": self.per_frame(),
+            "scores": {
+                name: {
+                    "name": self.names[name],
+                    "all": self._entries({kind: x[:, 0] for kind, x in kinds.items()}),
+                    "per_frame": self._entries({kind: x[:, 1:] for kind, x in kinds.items()}),
+                }
+                for name, kinds in self.scores.items()
+            },
         }
 
     def _entries(self, values: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
-        gains = {f"{TRUE} - {n}": values[TRUE] - x for n, x in values.items() if n != TRUE}
+        others = {n: x for n, x in values.items() if n not in (TRUE, TRUTH)}
+        gains = {f"{TRUE} - {n}": values[TRUE] - x for n, x in others.items()}
         return statistics.entries({**values, **gains}, self.walks.houses)
 
     def lines(self) -> list[str]:
-        """Return the table as text."""
+        """Return the tables as text: whole clips, and the frames of ``AT``."""
         out = [self.walks.about, "PSNR in dB, means over houses"]
-        for name, found in self.table().items():
-            low, high = found["low"], found["high"]
-            span = "" if low is None else f"  [{low:.2f}, {high:.2f}]"
-            out.append(f"  {name:<16} {found['mean']:6.2f}{span}")
+        out += _lines(self.table(), self.per_frame(), 2)
+        for found in self.facts()["scores"].values():
+            out += [f"{found['name']}, means over houses"]
+            out += _lines(found["all"], found["per_frame"], 3)
         return out
 
 
+def _lines(whole: Mapping[str, Any], frames: Mapping[str, Any], digits: int) -> list[str]:
+    """Return a line per kind of actions: the mean, its interval, and the means at some frames."""
+    out = []
+    for name, found in whole.items():
+        low, high, mean = found["low"], found["high"], found["mean"]
+        span = "" if low is None else f"  [{low:.{digits}f}, {high:.{digits}f}]"
+        each = frames[name]["mean"]
+        known = [(t, each[t - 1]) for t in AT if t <= len(each) and each[t - 1] is not None]
+        at = "".join(f"  frame {t}: {value:.{digits}f}" for t, value in known)
+        out.append(
+            f"  {name:<16} {'–' if mean is None else f'{mean:{digits + 4}.{digits}f}'}{span}{at}"
+        )
+    return out
+
+
 def measure(
-    config: Config, params: Params, episodes: Sequence[Episode], clips: int, *, seed: int = 0
+    config: Config,
+    params: Params,
+    episodes: Sequence[Episode],
+    clips: int,
+    *,
+    seed: int = 0,
+    measures: Measures | None = None,
 ) -> Steered:
-    """Imagine at most ``clips`` walks with true, shuffled and no actions, all with the same noise.
+    """Imagine at most ``clips`` clips with true, shuffled and no actions, all with the same noise.
+
+    The clips have ``evaluate.chain`` times the frames that the model imagines at once.
 
     Raises:
         UserError: the episodes are too short, have no walks, or are all from one house.
     """
-    pieces = _Pieces(config, params, episodes, choose_walks(config, episodes, clips), seed)
+    walks = choose_walks(config, episodes, clips, config.evaluate.chain)
+    pieces = _Pieces(config, params, episodes, walks, seed, measures or Measures())
     with Meter("steering", len(pieces.keys) * pieces.size, "clips") as meter:
         found = {}
         for key in pieces.keys:
-            found[key] = pieces.errors(*key)
+            found[key] = pieces.scores(*key)
             meter.advance(pieces.size)
     return pieces.joined(found)
 
@@ -268,38 +196,38 @@ def score(
     choices: Sequence[ClipChoice],
     cache: ResultCache,
     log: Callable[[str], Any],
+    measures: Measures | None = None,
 ) -> tuple[Steered | None, str | None]:
     """Measure steering for a report; resumable, and shared among processes.
 
-    As many walks as the report has clips are chosen from the same episodes. Returns the results and
-    a description of the clips. If the episodes have no walks in two houses, the results are None
+    As many clips as the report has are chosen from the same episodes. Returns the results and a
+    description of the clips. If the episodes have no such clips in two houses, the results are None
     and the description gives the reason; both are None if the model is not controlled by actions.
     """
     if not config.model.capabilities.silent_actions:
         return None, None
-    if steered_by_record(config.model):
-        return None, "Steering is not measured: it compares walks, and the actions are not planar."
     among = {choice.episode for choice in choices}
     try:
         walks = choose_walks(config, episodes, len(choices), config.evaluate.chain, among)
     except UserError as error:
         return None, f"Steering is not measured: {error}"
-    pieces = _Pieces(config, params, episodes, walks, config.evaluate.seeds[0])
+    measures = measures or Measures()
+    pieces = _Pieces(config, params, episodes, walks, config.evaluate.seeds[0], measures)
 
     def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
         log("imagining with true, shuffled and no actions …")
         for key in todo:
-            yield key, {"errors": pieces.errors(*key)}
+            yield key, pieces.scores(*key)
 
     found = map_resumable(
         pieces.keys,
-        lambda key: f"steering-walks-{key[0]}-clip{key[1]:04d}",
+        lambda key: f"steering-walks2-{measures.key}-{key[0]}-clip{key[1]:04d}",
         work,
         cache=cache,
         what="steering",
         workers=workers(),
     )
-    return pieces.joined({key: piece["errors"] for key, piece in found.items()}), walks.about
+    return pieces.joined(found), walks.about
 
 
 class _Pieces:
@@ -312,62 +240,112 @@ class _Pieces:
         episodes: Sequence[Episode],
         walks: Walks,
         seed: int,
+        measures: Measures,
     ):
         self.config, self.params, self.seed = config, params, seed
-        self.episodes, self.walks = episodes, walks
+        self.episodes, self.walks, self.measures = episodes, walks, measures
         self.size = min(config.evaluate.batch, len(walks.choices))
         self._silent = _with_zero_actions(config, params)
         self._imagine = jax.jit(_imagined, static_argnums=0)
         kinds = (TRUE, SHUFFLED, *([NONE] if self._silent is not None else []), COPY)
+        kinds += (TRUTH,) if measures.structure is not None or measures.arms else ()
         starts = range(0, len(walks.choices), self.size)
-        self.keys = [(kind, first) for kind in kinds for first in starts]
+        self.keys = [(kind, first) for first in starts for kind in kinds]
+        self._batch = functools.lru_cache(1)(self._load_batch)
 
-    def errors(self, kind: str, first: int) -> np.ndarray:
-        """Return (clips, N) mean squared errors of a batch."""
-        batch = slice(first, first + self.size)
-        parts = [self._load(choice) for choice in self.walks.choices[batch]]
+    def scores(self, kind: str, first: int) -> dict[str, np.ndarray]:
+        """Return the ``errors`` (clips, N) of a batch, and its scores (clips, 1 + N) by name."""
+        context, truth, controls = self._batch(first)
+        count = len(controls)
+        if kind == TRUTH:
+            rgb = truth.rgb_THWC
+        elif kind == COPY:
+            rgb = np.repeat(context.rgb_THWC[:, -1:], truth.rgb_THWC.shape[1], 1)
+        else:
+            given = controls
+            if kind == SHUFFLED:
+                others = self.walks.others[first : first + self.size]
+                pairs = zip(controls, others, strict=True)
+                given = [_with_actions(one, self._load(other)[2]) for one, other in pairs]
+            weights = self._silent if kind == NONE else self.params
+            numbers, padded = np.arange(first, first + self.size), stack(given, self.size)
+            rgb = self._imagine(self.config, weights, context, padded, self.seed, numbers)
+        off = jnp.square(unit_colours(rgb) - unit_colours(truth.rgb_THWC))
+        found = {"errors": np.asarray(off.mean((2, 3, 4)))[:count]}
+        if self.measures.lpips is not None and kind != TRUTH:
+            each = np.asarray(self.measures.lpips.frames(rgb, truth.rgb_THWC))[:count]
+            found["lpips"] = np.concatenate([each.mean(1, keepdims=True), each], 1)
+        return found | self._by_masks(context, rgb, first, count)
+
+    def _by_masks(
+        self, context: Frames, rgb: Array, first: int, count: int
+    ) -> dict[str, np.ndarray]:
+        """Return the scores that compare masks: SCS, and the IoU of the arms."""
+        if self.measures.structure is None and not self.measures.arms:
+            return {}
+        whole = jnp.concatenate([unit_colours(context.rgb_THWC[:, -1:]), unit_colours(rgb)], 1)
+        videos = np.rint(255 * np.clip(np.asarray(whole), 0, 1)).astype(np.uint8)
+        found: dict[str, list[np.ndarray]] = {name: [] for name in ("scs", "arms")}
+        for video, choice in zip(videos, self.walks.choices[first : first + count], strict=False):
+            episode = self.episodes[choice.episode]
+            tracked: Tracked = tracked_of(episode, choice)
+            if self.measures.structure is not None:
+                found["scs"].append(tracked.score(self.measures.structure, video))
+            if self.measures.arms:
+                true = np.isin(tracked.ids_THW, arm_ids(episode.info))
+                each = arms_iou(arms_by_colour(video[1:]), true[1:])
+                found["arms"].append(np.append(average(each), each))
+        return {name: np.stack(values) for name, values in found.items() if values}
+
+    def _load_batch(self, first: int) -> tuple[Frames, Frames, list[Any]]:
+        parts = [self._load(choice) for choice in self.walks.choices[first : first + self.size]]
         context = stack([part[0] for part in parts], self.size)
         truth = stack([part[1] for part in parts], self.size)
-        if kind == COPY:
-            rgb = context.rgb_THWC[:, -1:]
-        else:
-            actions = [np.asarray(part[2]) for part in parts]
-            if kind == SHUFFLED:
-                actions = [np.asarray(self._load(one)[2]) for one in self.walks.others[batch]]
-            weights = self._silent if kind == NONE else self.params
-            filled = np.arange(first, first + self.size)
-            given = stack(actions, self.size)
-            rgb = self._imagine(self.config, weights, context, given, self.seed, filled)
-        off = jnp.square(unit_colours(rgb) - unit_colours(truth.rgb_THWC))
-        return np.asarray(off.mean((2, 3, 4)))[: len(parts)]
+        return context, truth, [_arrays(part[2]) for part in parts]
 
     def _load(self, choice: ClipChoice) -> Any:
         return load_clip(self.config, self.episodes, choice)
 
-    def joined(self, found: Mapping[tuple[str, int], np.ndarray]) -> Steered:
-        """Combine the errors of all pieces."""
+    def joined(self, found: Mapping[tuple[str, int], Mapping[str, np.ndarray]]) -> Steered:
+        """Combine the results of all pieces."""
         kinds = dict.fromkeys(kind for kind, _ in self.keys)
-        errors = {
-            k: np.concatenate([found[key] for key in self.keys if key[0] == k]) for k in kinds
-        }
-        return Steered(errors, self.walks)
+
+        def together(name: str) -> dict[str, np.ndarray]:
+            parts = {k: [found[key] for key in self.keys if key[0] == k] for k in kinds}
+            known = {k: each for k, each in parts.items() if name in each[0]}
+            return {k: np.concatenate([one[name] for one in each]) for k, each in known.items()}
+
+        errors = {kind: each for kind, each in together("errors").items() if kind != TRUTH}
+        names = self.measures.names
+        return Steered(errors, self.walks, {name: together(name) for name in names}, names)
+
+
+def _arrays(control: Any) -> Any:
+    return jax.tree.map(np.asarray, control)
+
+
+def _with_actions(own: Any, other: Any) -> Any:
+    """Return a clip's control with the actions of another; its cameras and its state stay."""
+    if not isinstance(own, Control):
+        return _arrays(other)
+    return dataclasses.replace(own, actions_TA=np.asarray(other.actions_TA))
 
 
 def _imagined(
-    config: Config, params: Params, context: Frames, actions: Array, seed: int, numbers_B: Array
+    config: Config, params: Params, context: Frames, control: Any, seed: int, numbers_B: Array
 ) -> Array:
     """Return (B, N, H, W, 3) imagined colours."""
 
-    def one(context: Frames, moves: Array, number: Array) -> Array:
+    def one(context: Frames, control: Any, number: Array) -> Array:
         state = worlds.start(config, params, context)
         key = jax.random.fold_in(jax.random.key(seed), number)
-        return worlds.imagine(config, params, state, moves, key)[1].rgb_THWC
+        return worlds.imagine(config, params, state, control, key)[1].rgb_THWC
 
-    return jax.vmap(one)(context, actions, numbers_B)
+    return jax.vmap(one)(context, control, numbers_B)
 
 
 def _with_zero_actions(config: Config, params: Params) -> Params | None:
-    """Return weights whose control embeds every action as zero, or None without modulation."""
+    """Return weights whose control embeds every action as zero, or None if there are none."""
     if not config.model.capabilities.silent_actions or "control" not in params:
         return None
     return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

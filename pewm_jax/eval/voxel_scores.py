@@ -31,7 +31,6 @@ from pewm_jax.eval import horizon
 from pewm_jax.eval.horizon import RecordedWalk
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.metrics.videos import VideoDistance
-from pewm_jax.houses.generate import generate_house
 from pewm_jax.houses.kinds import GROUPS
 from pewm_jax.io.progress import Meter
 from pewm_jax.memory import class_grid
@@ -289,6 +288,9 @@ def _look_back(config: Config, params: Params, state: Any, camera: Camera, key: 
 
 def house_of(scene: str) -> Mapping[str, Any] | None:
     """Return rooms and doorways of a generated house by its name; None for other scenes."""
+    # Imported here: meshes take a while to import, and other evaluations need none.
+    from pewm_jax.houses.generate import generate_house  # noqa: PLC0415
+
     found = re.fullmatch(r"house-(\d+)", scene)
     return dict(generate_house(int(found[1])).metadata) if found else None
 
@@ -315,7 +317,7 @@ def cells_at(grid: ClassGrid, cell_m: float, points: np.ndarray) -> np.ndarray:
     """Return the class ids of the cells at points (..., 3); unknown outside of the grid."""
     cells = np.asarray(grid.classes_XYZ)
     at = np.floor((points - np.asarray(grid.low_3)) / cell_m).astype(int)
-    inside = ((at >= 0) & (at < cells.shape)).all(-1)
+    inside = np.asarray(((at >= 0) & (at < cells.shape)).all(-1))
     x, y, z = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
     return np.where(inside, cells[x, y, z], UNKNOWN)
 

@@ -137,6 +137,7 @@ def search(
     devices: int,
     tries: int,
     log: Callable[[str], Any] = print,
+    slices: int = 1,
 ) -> Search:
     """Compile the most promising combinations until ``ENOUGH`` fit.
 
@@ -147,13 +148,14 @@ def search(
         devices: number of devices.
         tries: largest number of combinations that are compiled.
         log: prints a line.
+        slices: number of slices that the devices make up; ``data`` is split over them.
 
     Raises:
         UserError: no mesh can split the batch over the devices; or the compiler fails on all.
     """
     log(f"{stage.title}: estimating memory and time of its settings for {devices} × {chip.name} …")
-    estimates = Estimates(config, stage, chip)
-    rest = list(choices(config, stage, devices))
+    estimates = Estimates(config, stage, topology.of_slices(chip, devices, slices))
+    rest = [one for one in choices(config, stage, devices) if one.mesh.data % slices == 0]
     if not rest:
         batch = stage.settings(config).batch
         raise UserError(
@@ -164,7 +166,14 @@ def search(
     while rest and len(done) < tries and sum(one.fits for one in done) < ENOUGH:
         choice = min(rest, key=estimates.order)
         rest.remove(choice)
-        found = _compile(config, stage, chip, devices, choice, estimates(choice))
+        changed, flags = choice.apply(config, stage), choice.flags(config, stage)
+        estimate = estimates(choice)
+        try:
+            report = target_compiler.compile_stage(changed, stage.name, chip, devices, slices)
+        except UserError as error:
+            found = Try(choice, flags, estimate, None, str(error))
+        else:
+            found = Try(choice, flags, estimate, dataclasses.replace(report, flags=flags))
         done.append(found)
         log(f"  {line(found)}")
         if found.report is not None:
@@ -172,17 +181,6 @@ def search(
     if all(one.report is None for one in done):
         raise UserError(done[-1].error)
     return Search(tuple(done), count)
-
-
-def _compile(
-    config: Config, stage: Stage, chip: Chip, devices: int, choice: Choice, estimate: Estimate
-) -> Try:
-    changed, flags = choice.apply(config, stage), choice.flags(config, stage)
-    try:
-        report = target_compiler.compile_stage(changed, stage.name, chip, devices)
-    except UserError as error:
-        return Try(choice, flags, estimate, None, str(error))
-    return Try(choice, flags, estimate, dataclasses.replace(report, flags=flags))
 
 
 def choices(config: Config, stage: Stage, devices: int) -> Iterator[Choice]:

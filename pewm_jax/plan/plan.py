@@ -105,6 +105,7 @@ def show(
     if file is not None:
         _require_writable(file)
     chip, on_target = chips.named(launch.chip), launch.compiler == "target"
+    topology.require_slices(chip, launch.slices)
     if on_target:
         topology.require_compiler(chip)
     if launch.inference:
@@ -154,7 +155,7 @@ def _fit_on_target(
     config: Config, stage: Stage, chip: Chip, launch: Launch, log: Any
 ) -> tuple[StageReport, Iterator[str]]:
     """Return the best settings of a stage that fit, according to a chip's compiler."""
-    found = fit.search(config, stage, chip, launch.devices, launch.tries, log)
+    found = fit.search(config, stage, chip, launch.devices, launch.tries, log, launch.slices)
     best = found.best.report
     assert best is not None
     best = dataclasses.replace(best, tries=[one.summary for one in found.tries])
@@ -189,7 +190,7 @@ def _plan_on_target(
     log(f"{stage.title}: compiling the real step for {sizes.devices} × {chip.name} …")
     if config.train.lora.rank:
         log(f"{stage.title}: {adapters(config, stage)}")
-    report = target_compiler.compile_stage(config, stage.name, chip, launch.devices)
+    report = target_compiler.compile_stage(config, stage.name, chip, launch.devices, launch.slices)
     return report, report_lines(report, stage.title, stage.settings(config).batch)
 
 

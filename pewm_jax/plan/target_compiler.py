@@ -81,6 +81,7 @@ class StageReport:
         tries: what was compiled to find them; of ``--fit`` only.
         trace_s: seconds of tracing and lowering.
         compile_s: seconds of compilation.
+        compile_cpu_s: processor time of compilation, in seconds, over all threads.
         notes: what is uncertain about the numbers.
     """
 
@@ -111,6 +112,7 @@ class StageReport:
     tries: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     trace_s: float = 0.0
     compile_s: float = 0.0
+    compile_cpu_s: float = 0.0
     notes: list[str] = dataclasses.field(default_factory=list)
 
 
@@ -119,13 +121,17 @@ def sent_by_axes(sent: Mapping[tuple[str, str], float]) -> list[dict[str, Any]]:
     return [{"kind": kind, "axis": axes, "bytes": size} for (kind, axes), size in sent.items()]
 
 
-def compile_stage(config: Config, stage: str, chip: Chip, devices: int) -> StageReport:
+def compile_stage(
+    config: Config, stage: str, chip: Chip, devices: int, slices: int = 1
+) -> StageReport:
     """Compile the training step of the stage of this name in a process of its own.
+
+    ``slices`` is the number of slices of TPUs that ``devices`` are.
 
     Raises:
         UserError: the compiler is not installed, or it fails for another reason than memory.
     """
-    return _ask(config, chip, stage, devices, "stage")
+    return _ask(config, chip, stage, devices, "stage", slices=slices)
 
 
 def compile_inference(config: Config, program: str, chip: Chip, quantize: str = "") -> StageReport:
@@ -134,11 +140,11 @@ def compile_inference(config: Config, program: str, chip: Chip, quantize: str = 
     Raises:
         UserError: as for ``compile_stage``.
     """
-    return _ask(config, chip, program, 1, "inference", quantize)
+    return _ask(config, chip, program, 1, "inference", quantize=quantize)
 
 
 def _ask(
-    config: Config, chip: Chip, name: str, devices: int, kind: str, quantize: str = ""
+    config: Config, chip: Chip, name: str, devices: int, kind: str, **more: Any
 ) -> StageReport:
     """Start the process that compiles, and return its report."""
     topology.require_compiler(chip)
@@ -149,8 +155,8 @@ def _ask(
         "name": name,
         "chip": chip.name,
         "devices": devices,
-        "quantize": quantize,
         "parent": os.getpid(),
+        **more,
     }
     with tempfile.TemporaryDirectory(prefix="pewm-plan-") as folder:
         asked, answered = Path(folder) / "request.json", Path(folder) / "report.json"
@@ -204,7 +210,7 @@ def main(asked: str, answered: str) -> None:
         if request["kind"] == "inference":
             report = _inference(config, request["name"], chip, request["quantize"])
         else:
-            report = _stage(config, request["name"], chip, request["devices"])
+            report = _stage(config, request["name"], chip, request["devices"], request["slices"])
         answer = dataclasses.asdict(report)
     except UserError as error:
         answer = {"error": str(error)}
@@ -226,7 +232,7 @@ def _load(name: str, file: str) -> None:
     spec.loader.exec_module(sys.modules[name])
 
 
-def _stage(config: Config, name: str, chip: Chip, count: int) -> StageReport:
+def _stage(config: Config, name: str, chip: Chip, count: int, slices: int) -> StageReport:
     """Trace and compile a stage, in the process for it."""
     import jax  # noqa: PLC0415 - only this process uses JAX
 
@@ -235,7 +241,8 @@ def _stage(config: Config, name: str, chip: Chip, count: int) -> StageReport:
     from pewm_jax.train import runs, sharding, step  # noqa: PLC0415
 
     (stage,) = (one for one in runs.planned(config) if one.name == name)
-    mesh = sharding.make_mesh(topology.devices(chip, count), config.train.mesh)
+    mesh = sharding.make_mesh(topology.devices(chip, count, slices), config.train.mesh)
+    chip = topology.of_slices(chip, count, slices)
     sizes = measure.MeshSizes(**{name: mesh.shape[name] for name in AXES})
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
     given = stage.extra_weights(config.model, config.train) if stage.extra_weights else None
@@ -295,7 +302,7 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
     from pewm_jax.plan import measure, program, suggest  # noqa: PLC0415
 
     sizes = measure.MeshSizes(**report.mesh)
-    began = time.monotonic()
+    began, cpu_began = time.monotonic(), _processor_time()
     with tempfile.TemporaryDirectory(prefix="pewm-hlo-") as folder:
         # A TPU's compiled program cannot always be printed; what its compiler writes can be read.
         written: dict[str, str | bool] = (
@@ -311,8 +318,9 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
                 options = NO_TRITON
                 compiled = lowered.compile(compiler_options={**written, **options})
         except jax.errors.JaxRuntimeError as error:
-            return _refused(report, str(error), time.monotonic() - began, options)
-        compile_s = time.monotonic() - began
+            seconds = time.monotonic() - began, _processor_time() - cpu_began
+            return _refused(report, str(error), seconds, options)
+        seconds = time.monotonic() - began, _processor_time() - cpu_began
         text = _text(compiled, Path(folder))
     memory: Any = compiled.memory_analysis()
     arguments, temporary = measure.device_memory(compiled)
@@ -325,7 +333,8 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
         alias_bytes=float(memory.alias_size_in_bytes),
         peak_bytes=arguments + temporary,
         fits=arguments + temporary <= report.capacity_bytes,
-        compile_s=compile_s,
+        compile_s=seconds[0],
+        compile_cpu_s=seconds[1],
     )
     if not text:
         report.notes.append("The compiler does not print this program: its kernels are unknown.")
@@ -349,6 +358,11 @@ def _compiled(report: StageReport, lowered: Any, config: Config, chip: Chip) -> 
     return _timed(report, config, chip, link_s)
 
 
+def _processor_time() -> float:
+    """Return the processor time of this process and of the assemblers that it started."""
+    return math.fsum(os.times()[:4])
+
+
 def _text(compiled: Any, folder: Path) -> str:
     """Return the text of a compiled program, or nothing if it is not available."""
     from jax.errors import JaxRuntimeError  # noqa: PLC0415 - only this process uses JAX
@@ -364,9 +378,11 @@ def _text(compiled: Any, folder: Path) -> str:
 
 
 def _refused(
-    report: StageReport, message: str, seconds: float, options: dict[str, Any]
+    report: StageReport, message: str, seconds: tuple[float, float], options: dict[str, Any]
 ) -> StageReport:
     """Return the report of a program that the compiler refuses for its memory.
+
+    ``seconds`` are those of compilation and of the processor.
 
     Raises:
         UserError: it refuses for another reason.
@@ -386,7 +402,8 @@ def _refused(
         peak_bytes=peak,
         capacity_bytes=available or report.capacity_bytes,
         refusal=sentence[:400],
-        compile_s=seconds,
+        compile_s=seconds[0],
+        compile_cpu_s=seconds[1],
     )
 
 

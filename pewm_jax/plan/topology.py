@@ -34,8 +34,10 @@ ENVIRONMENT = {
     "TPU_SKIP_MDS_QUERY": "1",
     "TPU_WORKER_HOSTNAMES": "localhost",
     "TPU_ACCELERATOR_TYPE": "v5p-8",
+    "ALLOW_MULTIPLE_LIBTPU_LOAD": "1",
 }
-"""Environment variables of the process that compiles: no devices, and no search for them."""
+"""Environment variables of the process that compiles: no devices, no search for them, and no lock
+that only one process may hold."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,12 +166,13 @@ def capacity(chip: Chip) -> float:
     return USABLE[chip.name]
 
 
-def devices(chip: Chip, count: int) -> Sequence[Any]:
+def devices(chip: Chip, count: int, slices: int = 1) -> Sequence[Any]:
     """Return described devices; the process needs the variables of ``ENVIRONMENT``.
 
     Raises:
         UserError: the chip has no topology of this many devices.
     """
+    require_slices(chip, slices)
     from jax.experimental import topologies  # noqa: PLC0415 - loads the compiler's library
 
     if chip.platform == "cuda":
@@ -186,13 +189,29 @@ def devices(chip: Chip, count: int) -> Sequence[Any]:
         return described.devices
     options = {"chip_config_name": "megacore"} if chip.name == "v4" else {}
     described = topologies.get_topology_desc(
-        platform="tpu", topology_name=tpu_topology(chip, count), **options
+        platform="tpu",
+        topology_name=tpu_topology(chip, count // slices),
+        **({"num_slices": slices} if slices > 1 else {}),
+        **options,
     )
     if len(described.devices) != count:
         raise UserError(
             f"--devices is {count}: {chip.name} has topologies of {len(described.devices)} devices."
         )
     return described.devices
+
+
+def require_slices(chip: Chip, slices: int) -> None:
+    """Raise an error if a chip has no slices."""
+    if slices > 1 and chip.platform != "tpu":
+        raise UserError(
+            f"--slices is {slices}: {chip.name} has none; only TPUs are made up of slices."
+        )
+
+
+def of_slices(chip: Chip, count: int, slices: int) -> Chip:
+    """Return a chip whose islands of fast links are the slices that ``count`` devices make up."""
+    return dataclasses.replace(chip, island=count // slices) if slices > 1 else chip
 
 
 def tpu_topology(chip: Chip, count: int) -> str:

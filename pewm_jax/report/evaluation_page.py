@@ -16,6 +16,7 @@ from pewm_jax.report.labels import (
     METHOD_NAMES,
     METRIC_NAMES,
     RIVALS,
+    TRUTH_NAME,
     heading,
     labelled,
     own_method,
@@ -115,7 +116,7 @@ def evaluation_page(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         figure = Figure(png(gallery.above), alt="the map from above", caption=gallery.above_note)
         above = Section("The map, from above", [figure])
     measured = (
-        *(scores, houses, steering, structure, videos),
+        *(scores, houses, steering, steering_scores, structure, videos),
         *(_frame_by_frame, drift, growth, mirror, coverage, voxels),
     )
     sections = [_rollouts(gallery), *(part(metrics) for part in measured), above]
@@ -247,14 +248,51 @@ def steering(metrics: Mapping[str, Any]) -> Section | None:
         if name in found["all"]
     ]
     heads = ["PSNR, dB", "all frames", *(f"frame {t + 1}" for t in ends)]
+    recorded = found.get("recorded")
+    walks = "clips with the same noise" if recorded else "walks with the same noise"
     note = (
-        f"{found['clips']} walks with the same noise: {100 * found['forward']:.0f} % of their "
+        f"{found['clips']} {walks}: {100 * found['forward']:.0f} % of their "
         "steps go forward. Another clip's actions are those of a clip in another house; they "
         f"differ in {100 * found['different']:.0f} % of the steps. Means over houses, in brackets "
         "the interval of a bootstrap over them. A world that follows its actions is closest to the "
         "ground truth with the true ones."
     )
     return Section.of_table("Do the actions steer the model?", heads, rows, note)
+
+
+STEERING_NOTES = {
+    "lpips": "LPIPS is better the lower it is.",
+    "scs": "SCS is 100 × IoU of the masks of objects, exact in the true clip and segmented in the "
+    "imagined one.",
+    "arms": "The IoU of the arms compares the agent's arms and hands, found by their colour, with "
+    "their exact masks, in frames that show them.",
+}
+"""Score of steered clips → a sentence about it."""
+
+
+def steering_scores(metrics: Mapping[str, Any]) -> Section | None:
+    """Return LPIPS, SCS and the IoU of arms by kind of actions; None if none was measured."""
+    found = (metrics.get("steering") or {}).get("scores")
+    if not found:
+        return None
+    rows, columns = [], None
+    for name, one in found.items():
+        digits = 1 if name == "scs" else 3
+        frames = len(one["per_frame"]["true"]["mean"])
+        columns = sorted({0, *(t - 1 for t in (4, 8, 16) if t <= frames), frames - 1})
+        rows.append(heading_row(one["name"]))
+        labels = {**ACTIONS_NAMES, "truth": TRUTH_NAME}
+        for kind, label in labels.items():
+            if kind in one["all"]:
+                whole, steps = one["all"][kind], one["per_frame"][kind]
+                cells = _whole_and_frames(whole, steps, columns, digits, sign="-" in kind)
+                rows.append(row(label, *cells, highlight="-" in kind))
+    heads = ["", "all frames", *(f"frame {t + 1}" for t in columns or ())]
+    note = (
+        "The same clips as above; means over houses, in brackets the interval of a bootstrap over "
+        f"them. {' '.join(STEERING_NOTES[name] for name in found)}"
+    )
+    return Section.of_table("Do the actions steer objects and arms?", heads, rows, note)
 
 
 def structure(metrics: Mapping[str, Any]) -> Section | None:

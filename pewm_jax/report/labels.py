@@ -62,6 +62,8 @@ ACTIONS_NAMES = {
     "true - copy": "true minus the observed frame",
 }
 """Labels of the kinds of actions given to a model, and of their differences."""
+TRUTH_NAME = "the true clip"
+"""Label of the ceiling of scores that need a segmentation."""
 NONE_HOW = (
     "There is no row for a model trained equally long without a memory: train one with the same "
     "clip, codec and number of steps, all in stage 1 (--train.stage1.steps N --train.stage2.steps "
@@ -242,7 +244,16 @@ def format_steering(metrics: Mapping[str, Any]) -> list[str]:
         if name.startswith("true - ")
     )
     true = spread(found["all"]["true"], 2)
-    return [f"PSNR with the true actions is {true} dB; its lead over {'; over '.join(less)}."]
+    lines = [f"PSNR with the true actions is {true} dB; its lead over {'; over '.join(less)}."]
+    for one in found.get("scores", {}).values():
+        known = {"true": "true", "shuffled": "another clip's", "copy": "copying"}
+        values = (
+            f"{label} {spread(one['all'][kind], 3)}"
+            for kind, label in known.items()
+            if one["all"].get(kind, {}).get("mean") is not None
+        )
+        lines.append(f"{one['name']} with actions: {'; '.join(values)}.")
+    return lines
 
 
 VOXEL_ROWS = {

@@ -192,7 +192,7 @@ class Prepared:
         return _oldest(self._config, self._done) + len(self.batches)
 
     def fill(self, unless_stopped: Callable[[Callable[[], Any]], Any]) -> bool:
-        """Prepare ``data.prepared`` clips, rounded up to batches, at most those drawn; or read them.
+        """Prepare ``data.prepared`` clips, in whole batches, at most those drawn; or read them.
 
         ``unless_stopped`` calls its argument, and returns None if training must stop. Returns
         whether all are there.

@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.experimental import mesh_utils
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -49,12 +50,26 @@ def rules(model: World) -> tuple[tuple[str, P], ...]:
 def make_mesh(devices: Sequence[Any] | None = None, arranged: MeshConfig = ALL_DATA) -> Mesh:
     """Make the mesh over the given devices; by default all devices, all along ``data``.
 
+    TPUs of several slices, which the data-centre network joins, are put together along ``data``.
+
     Raises:
-        ConfigError: the number of devices does not fit the requested mesh.
+        ConfigError: the number of devices, or of slices, does not fit the requested mesh.
     """
     devices = jax.devices() if devices is None else devices
-    types = (AxisType.Auto,) * len(AXES)
-    return jax.make_mesh(arranged.shape(len(devices)), AXES, types, devices=devices)
+    types, sizes = (AxisType.Auto,) * len(AXES), arranged.shape(len(devices))
+    slices = len({getattr(one, "slice_index", 0) for one in devices if one.platform == "tpu"})
+    if slices <= 1:
+        return jax.make_mesh(sizes, AXES, types, devices=devices)
+    data, *rest = sizes
+    if data % slices:
+        raise ConfigError(
+            f"train.mesh.data is {data}: use a multiple of the number of slices, {slices}, because "
+            "only data is split over slices; change it, or fsdp, tensor or context."
+        )
+    arranged_devices = mesh_utils.create_hybrid_device_mesh(
+        (data // slices, *rest), (slices, *[1] * len(rest)), devices
+    )
+    return Mesh(arranged_devices, AXES, axis_types=types)
 
 
 def of_state(model: World, mesh: Mesh | AbstractMesh, state: Any) -> Any:

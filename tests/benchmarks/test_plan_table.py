@@ -20,8 +20,8 @@ def tables(monkeypatch):
 
     asked = []
 
-    def compile_stage(config, name, chip, devices):
-        asked.append((name, chip.name, devices))
+    def compile_stage(config, name, chip, devices, slices):
+        asked.append((name, chip.name, devices if slices == 1 else (devices, slices)))
         if chip.name == "v5p" and name == "stage2":
             raise UserError("The compiler of v5p failed on stage2: no.")
         return report(name=name, chip=chip.name, devices=devices)
@@ -59,6 +59,18 @@ def test_both_tables_are_printed_and_finished_programs_are_kept(tables, tmp_path
     asked.clear()
     plan_table.main([*flags, "--only", "inference", "--names", "start", "--folder", str(tmp_path)])
     assert asked == [("start", "h100", 1), ("start", "v5p", 1)]
+
+
+def test_the_paper_s_presets_are_compiled_for_many_devices_and_slices_too(
+    tables, tmp_path, monkeypatch, capsys
+):
+    plan_table, asked = tables
+    monkeypatch.setattr(plan_table, "LARGE", ("tiny",))
+    flags = ["--presets", "tiny", "--only", "training", "--folder", str(tmp_path)]
+    plan_table.main([*flags, "--names", "stage1"])
+    wide = [("stage1", "v5p", (64, 4)), ("stage1", "v5e", 256)]
+    assert asked == [("stage1", "h100", 8), ("stage1", "v5p", 8), *wide]
+    assert "| tiny | 1 | 64 × v5p in 4 slices | fsdp 8 |" in capsys.readouterr().out
 
 
 def test_the_page_gets_the_tables(tables, tmp_path):

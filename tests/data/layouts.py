@@ -176,10 +176,11 @@ def dequantize(codes, low=0.01, high=10.0, shift=3.5):
     return np.exp(codes / 4095 * (ends[1] - ends[0]) + ends[0]) - shift
 
 
-def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None):
+def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None, states=None):
     """All episodes in one file of rows and one video per camera, as LeRobot writes small sets.
 
-    ``actions`` (episodes, T, A) replace the two numbers episode and frame.
+    ``actions`` (episodes, T, A) replace the two numbers episode and frame; ``states`` (episodes, T,
+    S) are ``observation.state``.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -189,15 +190,17 @@ def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None):
     video = {"video.fps": float(fps), "video.codec": "h264", "video.pix_fmt": "yuv420p"}
     features = {
         camera: {"dtype": "video", "shape": [height, width, 3], "info": video},
-        "action": {"dtype": "float32", "shape": [2], "names": ["left", "right"]}
-        if actions is None
-        else {"dtype": "float32", "shape": [len(actions[0][0])], "names": None},
+        "action": {"dtype": "float32", "shape": [2], "names": ["left", "right"]},
         "timestamp": {"dtype": "float32", "shape": [1], "names": None},
     }
     if depth:
         about = {"is_depth_map": True, "video.depth_min": 0.01, "video.depth_max": 10.0}
         about |= {"video.shift": 3.5, "video.use_log": True, "video.pix_fmt": "gray12le"}
         features[deep] = {"dtype": "video", "shape": [height, width, 1], "info": about}
+    given = {"action": actions, "observation.state": states}
+    given = {name: values for name, values in given.items() if values is not None}
+    for name, values in given.items():
+        features[name] = {"dtype": "float32", "shape": [len(values[0][0])], "names": None}
     if pose:
         features["observation.camera_pose"] = {"dtype": "float32", "shape": [4, 4]}
         features["observation.intrinsics"] = {"dtype": "float32", "shape": [4]}
@@ -206,8 +209,7 @@ def lerobot(folder, walks, *, depth=True, pose=True, fps=10, actions=None):
         for k in range(len(walk.pose)):
             row = {"episode_index": e, "frame_index": k, "index": start + k, "task_index": 0}
             row |= {"timestamp": k / fps, "action": [float(e), float(k)]}
-            if actions is not None:
-                row["action"] = [float(x) for x in actions[e][k]]
+            row |= {name: [float(x) for x in values[e][k]] for name, values in given.items()}
             if pose:
                 row["observation.camera_pose"] = walk.pose[k].tolist()
                 row["observation.intrinsics"] = walk.focal.tolist()

@@ -170,6 +170,23 @@ def test_a_lerobot_set_keeps_its_episodes_actions_and_tasks(tmp_path):
     assert only.length == 6
 
 
+def test_states_of_a_lerobot_set_arrive_and_can_be_its_actions(tmp_path):
+    pytest.importorskip("pyarrow")
+    rng, walks = np.random.default_rng(0), [layouts.hand_held(9)]
+    actions, states = (rng.normal(size=(1, 9, 25)).astype(np.float32) for _ in range(2))
+    given = {"depth": False, "pose": False, "actions": actions, "states": states}
+    src = layouts.lerobot(tmp_path / "src", walks, **given)
+    (episode,), _ = imported(src, tmp_path / "out", "lerobot")
+    np.testing.assert_array_equal(episode.states, states[0])
+    np.testing.assert_array_equal(episode.actions, actions[0, :-1])
+    (episode,), _ = imported(src, tmp_path / "own", "lerobot", actions="state", stride=2)
+    np.testing.assert_array_equal(episode.states, states[0, ::2])
+    np.testing.assert_array_equal(episode.actions, states[0, 2::2])
+    bare = layouts.lerobot(tmp_path / "bare", walks, depth=False, pose=False)
+    with pytest.raises(ConfigError, match=r"--actions state: .* has no feature observation.state"):
+        imported(bare, tmp_path / "x", "lerobot", actions="state")
+
+
 def test_the_pose_of_a_lerobot_set_is_that_of_its_camera(tmp_path):
     images, shape = {"dtype": "video", "shape": [48, 64, 3]}, {"dtype": "float32", "shape": [7]}
     cameras = [f"observation.images.{name}" for name in ("top", "front", "front_left")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 
@@ -118,6 +119,15 @@ def test_a_refused_import_leaves_a_split_as_it_was(tmp_path, scan):
         import_recording(config(scan, tmp_path, name="b", depth_scale=10.0), quiet)
     assert (tmp_path / "train" / dataset.MANIFEST).read_bytes() == before
     assert len(EpisodeSource(tmp_path / "train")) == 3
+
+
+def test_colours_of_7scenes_may_be_jpeg(tmp_path):
+    src = layouts.seven_scenes(tmp_path / "src", layouts.hand_held(3, focal=FOCAL))
+    for file in sorted(src.rglob("*.color.png")):
+        assert cv2.imwrite(str(file.with_suffix(".jpg")), cv2.imread(str(file)))
+        file.unlink()
+    import_recording(ImportConfig(src, tmp_path / "out", format="auto"), quiet)
+    assert EpisodeSource(tmp_path / "out" / "train")[0].length == 3
 
 
 def test_short_sequences_share_files_and_large_pictures_make_short_episodes(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from pewm_jax.config import Config, UserError
 from pewm_jax.eval import steering
 from pewm_jax.eval.clips import choose
-from pewm_jax.eval.steering import Walks, choose_walks, different_steps, forward_steps
+from pewm_jax.eval.walks import Walks, choose_walks, different_steps, forward_steps
 from pewm_jax.geometry.actions import FORWARD, TURN_LEFT, TURN_RIGHT, discrete_table, integrate
 from pewm_jax.geometry.cameras import pose_from_yaw
 from pewm_jax.io.store import ResultCache

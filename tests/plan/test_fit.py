@@ -40,7 +40,7 @@ class Compiler:
         monkeypatch.setattr(topology, "capacity", lambda chip: capacity)
         monkeypatch.setattr(target_compiler, "compile_stage", self)
 
-    def __call__(self, config, stage, chip, devices):
+    def __call__(self, config, stage, chip, devices, slices):
         settings, mesh = getattr(config.train, stage), config.train.mesh
         choice = Choice(
             config.model.backbone.remat, settings.micro_batches, MeshSizes(*mesh.shape(devices))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import pytest
 
 from pewm_jax import presets
-from pewm_jax.config import ConfigError, Launch, UserError
+from pewm_jax.config import ConfigError, Launch, MeshConfig, UserError
 from pewm_jax.nn import attention, target
 from pewm_jax.nn.target import Target
 from pewm_jax.plan import plan, program, target_compiler, topology
@@ -23,6 +23,16 @@ from pewm_jax.train import chips, flops
 
 ROOT = Path(__file__).parents[2]
 SMALL = ("--train.stage1.batch", "4", "--train.stage2.steps", "0", "--model.dtype", "bfloat16")
+
+
+def installed(name):
+    """Return the chip of this name; skip the test if its compiler is not installed."""
+    chip = chips.named(name)
+    try:
+        topology.require_compiler(chip)
+    except UserError as error:
+        pytest.skip(str(error))
+    return chip
 
 
 @pytest.mark.parametrize(
@@ -47,6 +57,19 @@ def test_numbers_of_devices_that_no_topology_has_are_refused():
     for chip, count in (("v5p", 7), ("tpu7x", 9), ("v6e", 6)):
         with pytest.raises(UserError, match="no topology of that many"):
             topology.tpu_topology(chips.named(chip), count)
+
+
+def test_only_tpus_have_slices_and_slices_are_equal():
+    launch = Launch(plan=True, chip="h100", devices=16, slices=2, compiler="target")
+    with pytest.raises(UserError, match="--slices is 2: h100 has none"):
+        plan.show(presets.load("tiny"), launch)
+    with pytest.raises(ConfigError, match="--slices is 3: use a divisor of --devices 8"):
+        Launch(slices=3, compiler="target")
+    with pytest.raises(ConfigError, match=r"--slices 2 describes .* add --compiler target"):
+        Launch(slices=2)
+    chip = chips.named("v5p")
+    assert topology.of_slices(chip, 64, 4).island == 16
+    assert topology.of_slices(chip, 64, 1) is chip
 
 
 def test_every_chip_has_a_capacity_near_its_memory_and_gpus_a_description():
@@ -113,12 +136,12 @@ REFUSALS = {
 def test_a_refusal_for_memory_is_an_answer_with_its_numbers(message):
     needed, available = (number * 2**30 for number in REFUSALS[message])
     assert target_compiler.parse_refusal(message) == (needed, available)
-    refused = target_compiler._refused(report(), message, 3.0, {})
+    refused = target_compiler._refused(report(), message, (3.0, 2.0), {})
     assert not refused.fits
     arguments = report().argument_bytes if "temporaries" in message else 0.0
     assert (refused.peak_bytes, refused.capacity_bytes) == (needed + arguments, available)
     with pytest.raises(UserError, match=r"failed on stage1: INTERNAL: something"):
-        target_compiler._refused(report(), "INTERNAL: something", 3.0, {})
+        target_compiler._refused(report(), "INTERNAL: something", (3.0, 2.0), {})
 
 
 def report(**changes):
@@ -155,7 +178,7 @@ def report(**changes):
 def test_the_plan_prints_every_stage_and_writes_the_numbers(monkeypatch, tmp_path):
     asked = []
 
-    def compile_stage(config, stage, chip, devices):
+    def compile_stage(config, stage, chip, devices, slices):
         asked.append((stage, chip.name, devices))
         return report(name=stage)
 
@@ -241,7 +264,7 @@ def test_communication_is_named_by_the_axes_of_the_mesh():
     }
 
 
-INDEPENDENT = """
+INDEPENDENT = '''
 import functools, sys
 import jax, numpy as np
 from jax.experimental import topologies
@@ -262,7 +285,27 @@ settings = dataclasses.replace(
         stage2=dataclasses.replace(settings.train.stage2, steps=0),
     ),
 )
-devices = topologies.get_topology_desc(platform="tpu", topology_name="v5e:2x2").devices
+H100 = """
+gpu_device_info {
+  core_count: 132 fpus_per_core: 128 shared_memory_per_core: 233472
+  shared_memory_per_block_optin: 232448 memory_bandwidth: 3352320000000 l2_cache_size: 52428800
+  clock_rate_ghz: 1.98 device_memory_size: 84942979072 cuda_compute_capability { major: 9 }
+  threads_per_block_limit: 1024 threads_per_warp: 32 shared_memory_per_block: 49152
+  threads_per_core_limit: 2048 block_dim_limit_x: 2147483647 block_dim_limit_y: 65535
+  block_dim_limit_z: 65535 registers_per_core_limit: 65536 registers_per_block_limit: 65536
+}
+runtime_version { major: 12 minor: 8 patch: 0 } platform_name: "CUDA"
+dnn_version_info { major: 9 minor: 7 } device_description_str: "NVIDIA H100 80GB HBM3"
+"""
+if sys.argv[1] == "v5e":
+    described = topologies.get_topology_desc(platform="tpu", topology_name="v5e:2x2")
+    kind = target.Target("tpu")
+else:
+    described = topologies.get_topology_desc(
+        "h100", platform="cuda", target_config=H100, topology="1x1x4"
+    )
+    kind = target.Target("cuda", (9, 0))
+devices = described.devices
 mesh = Mesh(
     np.array(devices).reshape(4, 1, 1, 1), config.AXES, axis_types=(AxisType.Auto,) * 4
 )
@@ -273,7 +316,7 @@ clip = abstract.clip(settings, 4)
 place = lambda tree, where: jax.tree.map(
     lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), tree
 )
-with jax.set_mesh(mesh), target.use(target.Target("tpu")):
+with jax.set_mesh(mesh), target.use(kind):
     function = jax.jit(
         functools.partial(step.train_step, settings, stage),
         out_shardings=(jax.tree.map(lambda _: everywhere, state), everywhere),
@@ -283,24 +326,22 @@ with jax.set_mesh(mesh), target.use(target.Target("tpu")):
 found = lowered.compile().memory_analysis()
 new = found.output_size_in_bytes - found.alias_size_in_bytes
 print(found.argument_size_in_bytes + found.temp_size_in_bytes + new)
-"""
+'''
 
 
 @pytest.mark.slow
-def test_the_peak_is_that_of_a_script_that_calls_the_compiler_itself(tmp_path):
-    try:
-        topology.require_compiler(chips.named("v5e"))
-    except UserError as error:
-        pytest.skip(str(error))
+@pytest.mark.parametrize("name", ["v5e", "h100"])
+def test_the_peak_is_that_of_a_script_that_calls_the_compiler_itself(name):
+    chip = installed(name)
     config = presets.load("tiny").with_model(dtype="bfloat16")
     stages = {
         "stage1": dataclasses.replace(config.train.stage1, batch=4),
         "stage2": dataclasses.replace(config.train.stage2, steps=0),
     }
     config = dataclasses.replace(config, train=dataclasses.replace(config.train, **stages))
-    stage = target_compiler.compile_stage(config, "stage1", chips.named("v5e"), 4)
+    stage = target_compiler.compile_stage(config, "stage1", chip, 4)
     done = subprocess.run(
-        [sys.executable, "-c", INDEPENDENT],
+        [sys.executable, "-c", INDEPENDENT, name],
         env={**os.environ, **topology.ENVIRONMENT, "PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,
@@ -312,10 +353,7 @@ def test_the_peak_is_that_of_a_script_that_calls_the_compiler_itself(tmp_path):
 
 @pytest.mark.parametrize("chip", ["v5e", "h100"])
 def test_a_tiny_step_is_compiled_for_a_chip_that_is_not_there(tmp_path, chip):
-    try:
-        topology.require_compiler(chips.named(chip))
-    except UserError as error:
-        pytest.skip(str(error))
+    installed(chip)
     file = tmp_path / "plan.json"
     flags = ("--chip", chip, "--devices", "4", "--compiler", "target", "--json", str(file))
     done = subprocess.run(
@@ -338,6 +376,28 @@ def test_a_tiny_step_is_compiled_for_a_chip_that_is_not_there(tmp_path, chip):
     assert {item["axis"] for item in stage.collectives} == {"data"}
     assert "fits: " in done.stdout
     assert dataclasses.asdict(stage)["compiler"]["version"]
+
+
+@pytest.mark.slow
+def test_slices_are_joined_along_data_by_the_slower_network():
+    chip = installed("v5e")
+    config = presets.load("tiny").with_model(dtype="bfloat16")
+    train = dataclasses.replace(
+        config.train,
+        mesh=MeshConfig(data=2, fsdp=4),
+        stage1=dataclasses.replace(config.train.stage1, batch=8),
+    )
+    config = dataclasses.replace(config, train=train)
+    together, apart = (
+        target_compiler.compile_stage(config, "stage1", chip, 8, slices) for slices in (1, 2)
+    )
+    assert apart.fits
+    assert {"data", "fsdp"} <= {item["axis"] for item in apart.collectives}
+    assert (together.bound, apart.bound) == ("bytes", "collectives")
+    assert apart.roofline_s > together.roofline_s
+    wide = dataclasses.replace(config, train=dataclasses.replace(train, mesh=MeshConfig(fsdp=8)))
+    with pytest.raises(UserError, match=r"train\.mesh\.data is 1: use a multiple of .* slices, 2"):
+        target_compiler.compile_stage(wide, "stage1", chip, 8, 2)
 
 
 def test_a_compilation_ends_with_the_process_that_asked_for_it():

@@ -9,7 +9,11 @@ import pytest
 from jax import lax
 from jax.sharding import PartitionSpec as P
 
-from pewm_jax.train import flops, jaxprs
+from pewm_jax.data import abstract
+from pewm_jax.nn import attention
+from pewm_jax.train import flops, jaxprs, step
+from pewm_jax.worlds.pewm.world import STAGES
+from tests.plan import programs
 
 N, D, M = 6, 8, 4
 X, W, V = jnp.ones((N, D)), jnp.ones((D, M)), jnp.ones((M, D))
@@ -266,3 +270,19 @@ def test_axes_follow_a_weight(order):
     assert jaxprs._reshaped((2, 3, 5), (6, 5), axes) == ("a", "c")
     assert jaxprs._reshaped((6, 5), (2, 3, 5), ("a", "c")) == ("a", None, "c")
     assert np.prod(order) == 0
+
+
+@pytest.mark.slow
+def test_a_step_of_two_layers_counts_as_its_unrolled_program(monkeypatch):
+    # Not stage 2: a loop computes the gradient of its first layer's input, which is not needed.
+    config = programs.experiment(layers=2, heads=32, batch=32, remat=False)
+    stage, clip = STAGES[0], abstract.clip(config, 32)
+    state = jax.eval_shape(functools.partial(step.create, config, stage), jax.random.key(0))
+    args = state, clip, jax.random.key(0)
+    train_step = functools.partial(step.train_step, config, stage)
+    scan = lax.scan
+    monkeypatch.setattr(attention, "LOGITS", 2**40)  # no loop over heads on a CPU
+    counted = executed(train_step, *args)
+    monkeypatch.setattr(lax, "scan", lambda *a, **more: scan(*a, **{**more, "unroll": True}))
+    jax.clear_caches()
+    assert counted == pytest.approx(xla(train_step, *args), rel=0.01)

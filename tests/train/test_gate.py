@@ -119,7 +119,7 @@ def test_weights_that_come_with_the_library_are_found_by_name(tmp_path, monkeypa
         if isinstance(config.model, CodecTask):
             video = jnp.zeros((1, 2, 16, 24, 3))
             latents = config.model.codec.encode(params["codec"], video)
-            assert latents.shape == (1, 2, 2, 3, 16)
+            assert latents.shape == (1, 2, 2, 3, config.model.codec.latent_channels)
 
 
 def imagining(reader=None):

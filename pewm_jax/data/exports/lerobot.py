@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pewm_jax.bodies.humanoid import BODIES
 from pewm_jax.config import UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.data.exports.options import Chosen, ExportConfig, require_alike
@@ -120,8 +121,10 @@ def _columns(
     turn = Rotation.from_matrix(np.asarray(pose[:, :3, :3], np.float64)).as_quat()
     steps = np.arange(count)
     last = steps == count - 1
+    own = episode.states
+    placed = np.concatenate([pose[:, :3, 3], turn], 1) if own is None else own
     columns = {
-        STATE: np.concatenate([pose[:, :3, 3], turn], 1).astype(np.float32),
+        STATE: np.asarray(placed, np.float32),
         POSE: pose.reshape(count, 16),
         INTRINSICS: np.tile(np.asarray(episode.intrinsics_4, np.float32), (count, 1)),
     }
@@ -317,6 +320,9 @@ def _features(episode: Episode, fps: int, videos: Mapping[str, _Videos]) -> dict
             "shape": [1 if values.ndim == 1 else values.shape[1]],
             "names": None if name in DEFAULTS else NAMES.get(name),
         }
+    if episode.states is not None:
+        names = BODIES.get((episode.info.get("body") or {}).get("name", ""))
+        found[STATE]["names"] = names and [one.name for one in names.freedoms]
     if "action" in found and found["action"]["shape"] == [3]:
         found["action"]["names"] = ["dx", "dy", "dyaw"]
     return found

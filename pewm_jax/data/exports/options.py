@@ -125,16 +125,16 @@ def choose(config: ExportConfig) -> Chosen:
 
 
 def require_alike(episodes: Sequence[Episode], what: str) -> None:
-    """Raise UserError if episodes differ in image size, or in which actions they have."""
+    """Raise UserError if episodes differ in image size, or in which actions or states they have."""
 
     def facts(one: Episode) -> tuple[object, ...]:
-        width = None if one.actions is None else one.actions.shape[1]
-        return one.width, one.height, width, one.action_ids is not None
+        sizes = [None if x is None else x.shape[1] for x in (one.actions, one.states)]
+        return one.width, one.height, *sizes, one.action_ids is not None
 
     first = facts(episodes[0])
     for one in episodes:
         if facts(one) != first:
             raise UserError(
-                f"{one.name} differs from {episodes[0].name} in image size or in actions, and all "
-                f"episodes of a {what} data set are alike; choose --episodes."
+                f"{one.name} differs from {episodes[0].name} in image size, actions or states, and "
+                f"all episodes of a {what} data set are alike; choose --episodes."
             )

@@ -16,8 +16,9 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
+from pewm_jax.config import ConfigError
 from pewm_jax.data.formats import video
-from pewm_jax.data.formats.lerobot_features import INFO, Features, focal_of, poses_of
+from pewm_jax.data.formats.lerobot_features import INFO, STATE, Features, focal_of, poses_of
 from pewm_jax.data.formats.lerobot_tables import Row, Tables
 from pewm_jax.data.formats.options import ImportConfig
 from pewm_jax.data.formats.reader import (
@@ -41,7 +42,7 @@ class LeRobot(Format):
     LAYOUT: ClassVar[str] = f"{INFO}, meta/episodes/, data/ and videos/"
     CENTRES: ClassVar[str] = "half"
     DEPTH_SCALE: ClassVar[float | None] = None
-    USES: ClassVar[tuple[str, ...]] = ("camera", "pose")
+    USES: ClassVar[tuple[str, ...]] = ("camera", "pose", "actions")
 
     def recognise(self, src: Path) -> str:
         """Return what shows that a folder is a LeRobot data set."""
@@ -71,14 +72,23 @@ class _Cameras:
         self.depth = self.meta.depth_of(self.colour)
         self.pose = self.meta.pose(self.options.pose, self.colour)
         self.intrinsics = self.meta.intrinsics(self.colour)
+        self.by_state = self.options.actions == "state"
+        if self.by_state and self.meta.state is None:
+            raise ConfigError(
+                f"--actions state: {self.meta.root} has no feature {STATE} of numbers along one "
+                f"axis; it has {', '.join(self.meta.features)}."
+            )
 
     def open(self, row: Row) -> RawSequence:
         """Return the sequence of one episode."""
-        columns = [c for c in (self.pose, self.intrinsics, self.meta.action) if c]
+        numbers = (self.pose, self.intrinsics, self.meta.action, self.meta.state)
+        columns = [c for c in numbers if c]
         images = [c for c in (self.colour, self.depth) if c and not self.meta.is_video(c)]
         table = self.tables.rows(row, [*columns, "timestamp"])
         size = self.tables.image_size(row, self.colour)
         actions = table.get(self.meta.action or "")
+        states = table.get(self.meta.state or "")
+        states = None if states is None else states.reshape(row.length, -1)
         scale = None
         if self.depth:
             scale = self.meta.depth_codes(self.depth)[1]
@@ -101,6 +111,8 @@ class _Cameras:
             lambda k: f"{self.meta.root}, episode {row.index}, frame {k}",
             scale,
             actions_TA=None if actions is None else actions.reshape(row.length, -1)[:-1],
+            states_TS=states,
+            state_is_action=self.by_state,
             info={"task": row.task, "fps": self.meta.fps, "camera": self.colour},
             note=note,
         )

@@ -16,6 +16,8 @@ from pewm_jax.data.episodes import SATURATED
 from pewm_jax.geometry.cameras import pose_from_yaw
 
 INFO = "meta/info.json"
+STATE = "observation.state"
+"""Name of the feature that holds the agent's own state."""
 CODES = 4096
 """Number of depth codes; the lowest and the highest are no measurement."""
 POSES = ("world_from_camera", "camera_to_world", "camera_pose", "pose")
@@ -41,6 +43,11 @@ class Features:
                 "LeRobot's script convert_dataset_v21_to_v30."
             )
         self.action = "action" if "action" in self.features else None
+        self.state = STATE if self._is_vector(STATE) else None
+
+    def _is_vector(self, key: str) -> bool:
+        """Tell whether a feature exists and has numbers along one axis."""
+        return len(self.features.get(key, {}).get("shape") or []) == 1
 
     def is_video(self, key: str) -> bool:
         """Tell whether a feature is stored as a video."""

@@ -15,7 +15,7 @@ from pewm_jax.data.episodes import DEPTH_LIMIT_M
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 OF_FORMATS = (
     *("depth_scale", "trajectory", "camera", "pose", "metres_per_step", "min_confidence"),
-    *("episodes", "fov", "camera_height", "frames", "step", "turn_deg", "dataset"),
+    *("episodes", "fov", "camera_height", "frames", "step", "turn_deg", "dataset", "actions"),
 )
 """Options that only some formats use; a format names those that it uses."""
 
@@ -75,6 +75,9 @@ class ImportConfig:
     pose: str | None = None
     """LeRobot: feature of the camera's pose in the world: 16, 12 or 7 numbers (xyz, quaternion
     xyzw), or 3 (x, y, yaw)."""
+    actions: Literal["recorded", "state"] = "recorded"
+    """LeRobot: `recorded` takes the feature `action`, if there is one; `state` takes the feature
+    `observation.state` of the next frame that is kept, for data whose states are joint angles."""
     metres_per_step: float | None = None
     """NoMaD: length of one step of the robot; by default that of the data set that the folder's
     name tells (recon, scand, tartan, sacson)."""

@@ -64,6 +64,8 @@ class RawSequence:
         depth_scale: stored value of one metre; None if there is no depth.
         faults: frames that are known to be unusable, with the reason.
         actions_TA: (T − 1, A) recorded actions that are no planar motion, or None.
+        states_TS: (T, S) the agent's own state at each frame, such as the angles of its joints.
+        state_is_action: whether the action of a frame is the state at the next frame that is kept.
         voxels: returns the grids of some frames in a world that was turned by a (4, 4) matrix.
         info: facts about the episode that the format knows.
         note: a sentence for the user about what was taken from where.
@@ -77,6 +79,8 @@ class RawSequence:
     depth_scale: float | None = 1000.0
     faults: Mapping[int, str] = dataclasses.field(default_factory=dict)
     actions_TA: np.ndarray | None = None
+    states_TS: np.ndarray | None = None
+    state_is_action: bool = False
     voxels: Callable[[Sequence[int], np.ndarray], Any] | None = None
     info: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     note: str = ""

@@ -59,6 +59,11 @@ class DiTBackbone(DiTConfig, Backbone):
         return self.prompt == "stored"
 
     @property
+    def extra_tokens(self) -> bool:
+        """Whether further tokens may follow those of the text: not with a table of positions."""
+        return self.positions != "rope_learned" or self.learned == "drop"
+
+    @property
     def split_heads(self) -> int:
         """The number that ``train.mesh.tensor`` must divide."""
         return self.heads

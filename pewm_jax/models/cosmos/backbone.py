@@ -36,6 +36,7 @@ class CosmosBackbone(CosmosConfig, Backbone):
 
     SHARDING: ClassVar[Rules] = cosmos.SHARDING
     GUIDED_BY_TEXT: ClassVar[bool] = True
+    extra_tokens = True  # without an annotation this is no field
 
     @property
     def places(self) -> InjectionPoints:

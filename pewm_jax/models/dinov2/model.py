@@ -256,8 +256,10 @@ def preprocess(rgb_BHWC: Array, size: int | tuple[int, int], patch: int = 14) ->
     """
     height, width = (size, size) if isinstance(size, int) else size
     _require_multiples(height, width, patch)
-    rgb = jnp.asarray(rgb_BHWC)
-    rgb = jax.image.resize(rgb, (rgb.shape[0], height, width, 3), "cubic", antialias=True)
+    # Channels before pixels: XLA's CUDA compiler refuses these products in the other order.
+    planes = jnp.asarray(rgb_BHWC).transpose(0, 3, 1, 2)
+    planes = jax.image.resize(planes, (*planes.shape[:2], height, width), "cubic", antialias=True)
+    rgb = planes.transpose(0, 2, 3, 1)
     mean, std = (np.asarray(x, np.float32) for x in (MEAN_3, STD_3))
     share = (jnp.clip(rgb, -1, 1) + 1) / 2
     return ((share - mean) / std).astype(rgb.dtype)

@@ -148,8 +148,8 @@ def apply(
         cache=cache,
     )
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
-    sides = [count * config.patch for count in config.token_sides]
-    out = unpatchify(out, *sides, config.patch, config.patch)
+    x_side, y_side, z_side = (count * config.patch for count in config.token_sides)
+    out = unpatchify(out, x_side, y_side, z_side, config.patch, config.patch)
     low, high = (at * config.patch for at in config.levels)
     out = out.reshape(batch, frames, *out.shape[1:])
     beside = [(0, 0)] * 4 + [(low, config.latent_side - high), (0, 0)]

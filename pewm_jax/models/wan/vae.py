@@ -82,7 +82,7 @@ class WanVAECodec(PublishedVAE):
     latents_std: tuple[float, ...] = STD_16
     """Standard deviation of each channel. Neither encoding nor decoding uses the two;
     ``normalise`` and ``restore`` do."""
-    convolution: Literal["auto", "taps", "volume", "winograd"] = "auto"
+    convolution: Literal["auto", "stacked", "taps", "volume", "winograd"] = "auto"
     """The form of 3D convolutions, as in ``VAEConfig``."""
     depth: bool = True
     """Whether depth is encoded too, as grey pictures by the same weights, in as many channels more;

@@ -51,9 +51,7 @@ class EgoWMTrainConfig(TrainSettings):
     """Folder of this run: checkpoints, logs, images, report."""
     video: StageConfig = StageConfig(steps=0)
     """Trains a video model without actions, if there is no pre-trained one; skipped by default. A
-    random backbone that is trained with actions from the start does not learn to follow them: the
-    control and the layers that it modulates are initialized with zeros, so neither gets a
-    gradient."""
+    backbone with random weights learns to follow actions without it, too."""
     adapt: StageConfig = StageConfig()
     """The backbone is trained further, with actions; the control's learning rate is
     `model.control.rate` times this one's."""

@@ -21,6 +21,7 @@ from pewm_jax.geometry.cameras import einsum
 from pewm_jax.geometry.march import RayHits
 from pewm_jax.memory.class_grid import UNKNOWN, ClassGrid
 from pewm_jax.models.persist import voxel_renderer, voxel_vae
+from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Clip, Params
 from pewm_jax.worlds.persist import corruption, voxel_frames
 from pewm_jax.worlds.persist import state as grid_state
@@ -108,13 +109,16 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
     classes = cut_windows(model, clip, last, recorded)
     shape = classes.shape[:2]
     flat = classes.reshape(-1, *classes.shape[2:])
-    config, weights = model.backbone.voxel_vae, params["voxel_vae"]
-    dtype = jnp.dtype(model.dtype)
+    config, dtype = model.backbone.voxel_vae, jnp.dtype(model.dtype)
 
-    def encode(grid: Array) -> Array:
-        return voxel_vae.encode(config, weights, jnp.maximum(grid, 0)[None].astype(int), dtype)[0]
+    def encode(weights: Params, flat: Array) -> Array:
+        def one(grid: Array) -> Array:
+            ids = jnp.maximum(grid, 0)[None].astype(int)
+            return voxel_vae.encode(config, weights, ids, dtype)[0]
 
-    latents = jax.lax.map(encode, flat)
+        return jax.lax.map(one, flat)
+
+    latents = placement.by_batch(encode, params["voxel_vae"], flat)
     latents = latents.reshape(*shape, *latents.shape[1:])
     recorded_too = jax.vmap(jax.vmap(functools.partial(grid_state.known_latents, model)))(classes)
     token, wide = model.backbone.token_cells, model.side
@@ -242,11 +246,14 @@ def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
     camera = jax.tree.map(jnp.asarray, clip.frames.camera)
     pixels = (model.clip.height, model.clip.width)
 
-    def look(one: tuple[Array, Array, Camera]) -> RayHits:
-        grid, low, seen = one
-        return voxel_renderer.cast_rays(model.backbone.renderer, grid, low, size, seen, pixels)
+    def look(_: Params, *clips: Any) -> RayHits:
+        def one(clip: tuple[Array, Array, Camera]) -> RayHits:
+            grid, low, seen = clip
+            return voxel_renderer.cast_rays(model.backbone.renderer, grid, low, size, seen, pixels)
 
-    layers = jax.lax.map(look, (classes, corner, camera))
+        return jax.lax.map(one, clips)
+
+    layers = placement.by_batch(look, {}, classes, corner, camera)
     made = {
         "latents": pictures(model, params, clip)[0].astype(jnp.float16),
         "ids": layers.ids_L.astype(jnp.int16),
@@ -256,10 +263,15 @@ def layers(model: PersistModel, params: Params, clip: Clip) -> Clip:
     }
     if model.backbone.renderer.drawn:
 
-        def draw(one: tuple[Array, Array, Camera]) -> Array:
-            return jax.lax.map(lambda frame: draw_latents(model, params, *frame), one)
+        def draw(weights: Params, *clips: Any) -> Array:
+            def one(clip: tuple[Array, Array, Camera]) -> Array:
+                return jax.lax.map(lambda frame: draw_latents(model, weights, *frame), clip)
 
-        made["drawn"] = jax.lax.map(draw, (classes, corner, camera)).astype(jnp.float16)
+            return jax.lax.map(one, clips)
+
+        weights = {"codec": params.get("codec", {})}
+        drawn = placement.by_batch(draw, weights, classes, corner, camera)
+        made["drawn"] = drawn.astype(jnp.float16)
     return _prepared(clip, made)
 
 

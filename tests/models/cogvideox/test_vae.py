@@ -162,7 +162,8 @@ def test_every_form_of_a_convolution_agrees(frames):
         "bias": jnp.asarray(rng.normal(size=2), jnp.float32),
     }
     volume, *others = (
-        video_convolution.convolve(form, kernel, x) for form in ("volume", "taps", "winograd")
+        video_convolution.convolve(form, kernel, x)
+        for form in ("volume", "stacked", "taps", "winograd")
     )
     for other in others:
         np.testing.assert_allclose(other, volume, atol=1e-4)

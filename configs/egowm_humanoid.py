@@ -1,0 +1,37 @@
+"""EgoWM on a humanoid of 25 degrees of freedom, which sees its own arms: hours on two cores."""
+
+import dataclasses
+
+from pewm_jax.bodies.humanoid import HUMANOID
+from pewm_jax.config import Config
+from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.presets import egowm
+
+
+def config() -> Config:
+    """Return the settings of ``egowm_humanoid``.
+
+    They are those of ``egowm`` with another control: actions are the angles of the joints at the
+    next frame with the linear and the angular velocity, and the initial state is a further input
+    (Eq. 6). Its data: ``pewm-jax data collect data/humanoid --body humanoid --train 2000
+    --validation 32 --test 48 --frames 72 --step_m 0.12 --turn_deg 10 --turn_around 0 --test_policy
+    follow --ids``.
+    """
+    base, size = egowm.config(), HUMANOID.size
+    control = ModulationConfig(
+        actions=size,
+        state=size,
+        units=(1.0,) * size,
+        low=tuple(HUMANOID.low.tolist()),
+        high=tuple(HUMANOID.high.tolist()),
+        angles=(),
+        body="humanoid",
+    )
+    return dataclasses.replace(
+        base,
+        model=dataclasses.replace(base.model, control=control),
+        data=dataclasses.replace(
+            base.data, path="data/humanoid", prepared_path="data/humanoid_prepared"
+        ),
+        train=dataclasses.replace(base.train, run="runs/egowm_humanoid"),
+    )

@@ -1,0 +1,1 @@
+"""Articulated agents: joints, shapes, and motions of their arms."""

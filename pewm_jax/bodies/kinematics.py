@@ -1,0 +1,235 @@
+"""Forward kinematics of a body that is given as a list of joints.
+
+The frame of a body has x forward, y to the left and z up; its origin is on the floor. Every joint
+moves one link, which has the joint's name. At angle 0 the frames of all links are parallel to that
+of the body. A *state* of the body is one number for each of its degrees of freedom: angles of
+joints in radians, and last how far the body has moved and turned since the frame before.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from pewm_jax.errors import UserError, require
+
+FORWARD, TURN = "linear_velocity", "angular_velocity"
+"""The degrees of freedom of walking: metres forward and radians counter-clockwise since the frame
+before. They are the last two of every body."""
+OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""Pose of a camera (x right, y down, z forward) in a frame with x forward, y left, z up."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Freedom:
+    """A degree of freedom.
+
+    Attributes:
+        name: its name.
+        low: its smallest value.
+        high: its largest value.
+        rest: its value in the body's resting pose.
+        fastest: the largest change from one frame to the next; for those of walking, the largest
+            value.
+    """
+
+    name: str
+    low: float
+    high: float
+    rest: float = 0.0
+    fastest: float = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Joint:
+    """A revolute joint and the link that it moves.
+
+    Attributes:
+        name: the name of the link.
+        parent: the link that it is attached to; "" is the body's own frame.
+        origin: its position in the frame of the parent, metres.
+        axis: its axis, a unit vector; the angle is counter-clockwise about it.
+        freedom: the degree of freedom that moves it; "" if it is fixed.
+        gain: its angle is the value of the degree of freedom times this.
+    """
+
+    name: str
+    parent: str
+    origin: tuple[float, float, float]
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    freedom: str = ""
+    gain: float = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Body:
+    """An articulated body.
+
+    Attributes:
+        name: its name in settings.
+        freedoms: its degrees of freedom, in the order of a state; the last two are those of
+            walking.
+        joints: its joints, parents first.
+        eyes: the link that carries the camera, at its origin, looking along x.
+        arms: the links that are arms or hands.
+
+    Raises:
+        ConfigError: the list is inconsistent.
+    """
+
+    name: str
+    freedoms: tuple[Freedom, ...]
+    joints: tuple[Joint, ...]
+    eyes: str
+    arms: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        """Validate."""
+        names = [joint.name for joint in self.joints]
+        known = [one.name for one in self.freedoms]
+        for kind, listed in (("links", names), ("degrees of freedom", known)):
+            require(
+                len(set(listed)) == len(listed), f"body {self.name} has two {kind} of one name."
+            )
+        require(
+            known[-2:] == [FORWARD, TURN],
+            f"body {self.name}: the last two degrees of freedom must be {FORWARD} and {TURN}.",
+        )
+        for place, joint in enumerate(self.joints):
+            require(
+                joint.parent in ("", *names[:place]),
+                f"body {self.name}: joint {joint.name} comes before its parent {joint.parent!r}.",
+            )
+            require(
+                joint.freedom in ("", *known[:-2]),
+                f"body {self.name}: joint {joint.name} is moved by {joint.freedom!r}, which is not "
+                "one of the degrees of freedom.",
+            )
+            length = float(np.linalg.norm(joint.axis))
+            require(
+                abs(length - 1) < 1e-6,
+                f"body {self.name}: the axis of joint {joint.name} has length {length:.3g}, not 1.",
+            )
+        for link in (self.eyes, *self.arms):
+            require(link in names, f"body {self.name} has no link {link!r}.")
+        for one in self.freedoms:
+            require(
+                one.low <= one.rest <= one.high and one.low < one.high and one.fastest > 0,
+                f"body {self.name}: {one.name} rests at {one.rest}, outside {one.low} … {one.high},"
+                " or cannot move.",
+            )
+
+    @property
+    def size(self) -> int:
+        """A, the number of degrees of freedom."""
+        return len(self.freedoms)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """The names of the links."""
+        return tuple(joint.name for joint in self.joints)
+
+    @functools.cached_property
+    def low(self) -> np.ndarray:
+        """The smallest value of each degree of freedom."""
+        return np.array([one.low for one in self.freedoms])
+
+    @functools.cached_property
+    def high(self) -> np.ndarray:
+        """The largest value of each degree of freedom."""
+        return np.array([one.high for one in self.freedoms])
+
+    @functools.cached_property
+    def rest(self) -> np.ndarray:
+        """The state of the resting pose, standing still."""
+        return np.array([one.rest for one in self.freedoms])
+
+    @functools.cached_property
+    def fastest(self) -> np.ndarray:
+        """The largest change of each degree of freedom from one frame to the next."""
+        return np.array([one.fastest for one in self.freedoms])
+
+    def index(self, name: str) -> int:
+        """Return the place of a degree of freedom in a state."""
+        return [one.name for one in self.freedoms].index(name)
+
+    def poses(self, planar_T3: np.ndarray, state_TA: np.ndarray, scale: float = 1.0) -> np.ndarray:
+        """Return (T, L, 4, 4) float64 world_from_link.
+
+        Args:
+            planar_T3: x, y, yaw of the body in the world, metres and radians.
+            state_TA: the states.
+            scale: size of the body; shapes of links have to be scaled by it, too.
+
+        Raises:
+            UserError: the numbers of frames or degrees of freedom differ.
+        """
+        planar, state = np.asarray(planar_T3, np.float64), np.asarray(state_TA, np.float64)
+        if planar.ndim != 2 or planar.shape[1] != 3 or state.shape != (len(planar), self.size):
+            raise UserError(
+                f"body {self.name} got positions of shape {planar.shape} and states of shape "
+                f"{state.shape}: give (T, 3) and (T, {self.size})."
+            )
+        made = np.empty((len(planar), len(self.joints), 4, 4))
+        base = np.tile(np.eye(4), (len(planar), 1, 1))
+        base[:, :3, :3] = _turn((0.0, 0.0, 1.0), planar[:, 2])
+        base[:, :2, 3] = planar[:, :2]
+        places = {name: k for k, name in enumerate(self.links)}
+        for k, joint in enumerate(self.joints):
+            step = np.tile(np.eye(4), (len(planar), 1, 1))
+            step[:, :3, 3] = scale * np.array(joint.origin)
+            if joint.freedom:
+                angle = joint.gain * state[:, self.index(joint.freedom)]
+                step[:, :3, :3] = _turn(joint.axis, angle)
+            parent = base if not joint.parent else made[:, places[joint.parent]]
+            made[:, k] = parent @ step
+        return made
+
+    def world_from_camera(
+        self,
+        planar_T3: np.ndarray,
+        state_TA: np.ndarray,
+        scale: float = 1.0,
+        floor_z: float = 0.0,
+    ) -> np.ndarray:
+        """Return the (T, 4, 4) float32 poses of the camera; arguments as for ``poses``."""
+        place = self.links.index(self.eyes)
+        pose = self.poses(planar_T3, state_TA, scale)[:, place] @ OPTICAL
+        pose[:, 2, 3] += floor_z
+        return pose.astype(np.float32)
+
+    @functools.cached_property
+    def eye_m(self) -> float:
+        """Height of the camera above the floor with all joints at 0, metres."""
+        pose = self.world_from_camera(np.zeros((1, 3)), np.zeros((1, self.size)))
+        return float(pose[0, 2, 3])
+
+
+def _turn(axis: Sequence[float], angle_T: np.ndarray) -> np.ndarray:
+    """Return (T, 3, 3) rotations about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    sin, cos = np.sin(angle_T)[:, None, None], np.cos(angle_T)[:, None, None]
+    return np.eye(3) + sin * cross + (1 - cos) * (cross @ cross)
+
+
+def advance(planar_3: np.ndarray, state_A: np.ndarray) -> np.ndarray:
+    """Return the pose x, y, yaw after an action of any body: first move, then turn."""
+    x, y, yaw = np.asarray(planar_3, np.float64)
+    forward, turn = np.asarray(state_A, np.float64)[-2:]
+    return np.array([x + forward * np.cos(yaw), y + forward * np.sin(yaw), yaw + turn])
+
+
+def walking(planar_T3: np.ndarray) -> np.ndarray:
+    """Return (T, 2) the degrees of freedom of walking of a walk that never steps aside.
+
+    Those of frame 0 are 0.
+    """
+    planar = np.asarray(planar_T3, np.float64)
+    delta, yaw = np.diff(planar[:, :2], axis=0), planar[:-1, 2]
+    forward = delta[:, 0] * np.cos(yaw) + delta[:, 1] * np.sin(yaw)
+    turn = (np.diff(planar[:, 2]) + np.pi) % (2 * np.pi) - np.pi
+    return np.concatenate([np.zeros((1, 2)), np.stack([forward, turn], 1)])

@@ -1,0 +1,134 @@
+"""Steering of an agent with a body: clips of any posture, its own state, its arms in the score."""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pewm_jax import presets
+from pewm_jax.config import ClipConfig
+from pewm_jax.data.episodes import read_episode
+from pewm_jax.data.make_episode import CollectConfig, make_episode
+from pewm_jax.eval import clips, steering
+from pewm_jax.eval.metrics.structure import Consistency, follow_by_flow
+from pewm_jax.eval.walks import choose_walks
+from pewm_jax.report import evaluation_page
+from pewm_jax.report.labels import format_steering
+from pewm_jax.report.page import render
+from pewm_jax.types import Control
+
+SIZE, IMAGINED = 32, 4
+
+
+@functools.cache
+def config():
+    loaded = presets.load("egowm_humanoid")
+    model = dataclasses.replace(
+        loaded.model, clip=ClipConfig(frames=IMAGINED + 1, height=SIZE, width=SIZE, depth=False)
+    )
+    evaluate = dataclasses.replace(loaded.evaluate, chain=2, batch=2, clips=3)
+    data = dataclasses.replace(loaded.data, context=2)
+    return dataclasses.replace(loaded, model=model, evaluate=evaluate, data=data)
+
+
+@functools.cache
+def episodes():
+    collected = CollectConfig(
+        Path("unused"),
+        frames=28,
+        size=SIZE,
+        step_m=0.12,
+        turn_deg=10.0,
+        turn_around=0.0,
+        body="humanoid",
+        ids=True,
+        test_policy="follow",
+    )
+    return [read_episode(make_episode(collected, "revisit", k)) for k in range(3)]
+
+
+@pytest.fixture
+def told(monkeypatch):
+    """A world that imagines what truly followed the actions it is given, wherever it is."""
+    seen = []
+
+    def imagined(config, params, context, control, seed, numbers):
+        seen.append(control)
+        made = []
+        for actions in control.actions_TA:
+            made += [
+                episode.frames(range(start + 1, start + 9)).rgb_THWC
+                for episode in episodes()
+                for start in range(episode.length - 8)
+                if np.array_equal(episode.actions[start : start + 8], actions)
+            ]
+        if not params["control"]["kernel"].any():
+            made = [np.zeros_like(x) for x in made]
+        return np.stack(made).astype(np.float32) / 127.5 - 1
+
+    class Jax:
+        jit = staticmethod(lambda function, **_: function)
+        tree = steering.jax.tree
+
+    monkeypatch.setattr(steering, "_imagined", imagined)
+    monkeypatch.setattr(steering, "jax", Jax)
+    return seen
+
+
+def test_clips_need_not_walk_and_partners_move_differently():
+    walks = choose_walks(config(), episodes(), 6, 2)
+    assert walks.recorded
+    assert len(walks.choices) == 6
+    assert walks.different_C.min() >= 0.5
+    for one, other in zip(walks.choices, walks.others, strict=True):
+        assert one.scene != other.scene
+        assert len(one.targets_N) == 2 * IMAGINED
+    assert walks.about.startswith("6 clips in 3 houses")
+
+
+def test_the_control_has_the_state_of_the_present_frame():
+    choice = clips.choose(config(), episodes(), 3, 2)[1]
+    control = clips.load_clip(config(), episodes(), choice)[2]
+    episode = episodes()[choice.episode]
+    np.testing.assert_array_equal(control.state_A, episode.states[choice.start])
+    batch = clips.stack([control, control], 2)
+    later = clips.later_control(batch, IMAGINED, IMAGINED)
+    np.testing.assert_array_equal(later.state_A[0], episode.states[choice.start + IMAGINED])
+    np.testing.assert_array_equal(later.actions_TA, batch.actions_TA[:, IMAGINED:])
+    first = clips.later_control(batch, 0, IMAGINED)
+    np.testing.assert_array_equal(first.state_A, batch.state_A)
+
+
+def test_arms_and_objects_are_scored_by_kind_of_actions(told):
+    params = {"control": {"kernel": np.ones(1, np.float32)}}
+    measures = steering.Measures(None, Consistency(follow_by_flow, "flow"), arms=True)
+    assert steering.shows_arms(episodes())
+    found = steering.measure(config(), params, episodes(), 3, measures=measures)
+    assert all(isinstance(control, Control) for control in told)
+    np.testing.assert_allclose(told[0].state_A, told[1].state_A)  # the own state stays
+    assert np.abs(told[0].actions_TA - told[1].actions_TA).max() > 0.1
+    facts = found.facts()
+    arms, scs = (facts["scores"][name]["all"] for name in ("arms", "scs"))
+    assert arms["true"]["mean"] == pytest.approx(arms["truth"]["mean"])
+    assert arms["true"]["mean"] > 0.8
+    assert arms["shuffled"]["mean"] < 0.5 * arms["true"]["mean"]
+    assert arms["none"]["mean"] == 0
+    assert scs["true"]["mean"] == pytest.approx(scs["truth"]["mean"])
+    assert scs["true"]["mean"] > scs["shuffled"]["mean"]
+    assert facts["all"]["true"]["mean"] > 60
+    assert "truth" not in facts["all"]
+    assert len(facts["scores"]["arms"]["per_frame"]["true"]["mean"]) == 8
+    page = render("", [], [evaluation_page.steering_scores({"steering": facts})])
+    assert "IoU of the arms" in page
+    assert "frame 8" in page
+    sentences = format_steering({"steering": facts, "protocol": {}})
+    assert any(one.startswith("IoU of the arms with actions: true") for one in sentences)
+    assert any("frame 8:" in line for line in found.lines())
+
+
+def test_episodes_without_a_body_have_no_arms():
+    plain = dataclasses.replace(episodes()[0], info={})
+    assert not steering.shows_arms([plain])
+    assert not steering.shows_arms([])
