@@ -1,6 +1,7 @@
 """Scores of voxel worlds: unseen walls, doorways, what is lost, and how they are reported."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -257,6 +258,56 @@ def test_an_edit_is_made_in_another_room_and_seen_later(episode):
     for plan in plans:
         if plan is not None:
             assert 0 <= plan.start < plan.end < episode.length
+
+
+class Corridor:
+    """An episode in three rooms in a row, whose walls hide all that is not in the agent's room."""
+
+    scene, width, height = "house-0", 16, 16
+    intrinsics_4 = np.array([8, 8, 8, 8], np.float32)
+    house = {  # noqa: RUF012 - it is not changed
+        "seed": 0,
+        "rooms": [(0, 0, 3, 3), (3.1, 0, 6.1, 3), (6.2, 0, 9.2, 3)],
+        "doorways": [(1, 2, 6.1, 1.0, 6.2, 2.0)],
+    }
+
+    def __init__(self, x, yaw):
+        self.name = f"from {x[0]}"
+        self.world_from_camera = np.stack([pose(a, 1.5, b) for a, b in zip(x, yaw, strict=True)])
+        self.length = len(x)
+        self.actions = np.zeros((self.length - 1, 3), np.float32)
+
+    def frames(self, indices):
+        (at,) = indices
+        x = self.world_from_camera[at][0, 3]
+        wall = 3.0 if x < 3 else 6.15 if x < 6.15 else 9.2
+        facing = self.world_from_camera[at][0, 2] > 0
+        depth = np.full((1, 16, 16), wall - x if facing else 0.5, np.float32)
+        return SimpleNamespace(depth_THW=depth)
+
+
+def test_a_door_is_opened_from_a_third_room_if_any_walk_leads_from_one(monkeypatch):
+    monkeypatch.setattr(voxel_edits, "house_of", lambda scene: Corridor.house)
+    monkeypatch.setattr(voxel_edits, "_is_closed", lambda *arguments: True)
+    third = Corridor(np.arange(0.5, 5.0, 0.5), np.zeros(9))
+    found = voxel_edits.plan(MASKED, third, "door")
+    assert found is not None
+    at = third.world_from_camera[found.start][0, 3]
+    assert at < 3  # in the room that the door does not belong to
+    assert 6.15 - at <= voxel_edits.REACH_M
+    # In the door's own rooms, the agent turns away from the door and back to it.
+    beside = Corridor(np.full(6, 4.0), np.array([np.pi, np.pi, np.pi, 0, 0, 0]))
+    behind = Corridor(np.linspace(7, 4, 6), np.array([0, 0, 0, 0, 0, 0]))
+    for own in (beside, behind):
+        assert voxel_edits.plan(MASKED, own, "door") is None
+    assert voxel_edits.plan(MASKED, beside, "door", beside=True) is None
+    found = voxel_edits.plan(MASKED, behind, "door", beside=True)
+    assert found is not None
+    assert behind.world_from_camera[found.start][0, 3] > 6.2
+    first = functools.partial(voxel_edits.first_plan, MASKED)
+    assert first([behind, third], "door")[0] is third  # type: ignore[list-item]
+    assert first([beside, behind], "door")[0] is behind  # type: ignore[list-item]
+    assert first([beside], "door") == (None, None)  # type: ignore[list-item]
 
 
 def test_an_edit_changes_the_box_alone():
