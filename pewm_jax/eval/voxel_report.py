@@ -102,13 +102,22 @@ def score(
 
     found = map_resumable(
         keys,
-        lambda key: f"voxels-{key[0]}-{inputs_hash([key, settings])[:16]}",
+        lambda key: f"voxels-{key[0]}-{inputs_hash(_inputs(key, settings))[:16]}",
         work,
         cache=cache,
         what="voxels",
         workers=workers(),
     )
     return _facts(config, long, found, rows, i3d)
+
+
+def _inputs(key: Key, settings: Mapping[str, Any]) -> list[Any]:
+    """Return what a piece of work depends on, besides the protocol; no other row is among it."""
+    piece, name = key
+    inputs: list[Any] = [*key, MECHANISMS.get(name)]
+    if piece in (LONG, BESIDE):
+        inputs += [settings["long_sha256"], settings["frames"]]
+    return [*inputs, settings["beside"][name]] if piece == BESIDE else inputs
 
 
 def _read_walks(config: Config) -> _Walks:

@@ -18,6 +18,7 @@ from pewm_jax.eval import horizon, voxel_edits, voxel_report, voxel_scores
 from pewm_jax.eval.voxel_scores import UnseenCells
 from pewm_jax.houses.generate import object_boxes
 from pewm_jax.houses.kinds import FURNITURE, kind_of
+from pewm_jax.io.store import ResultCache
 from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.report import labels
@@ -325,3 +326,52 @@ def test_an_edit_changes_the_box_alone():
     assert (np.asarray(moved.map.classes_XYZ)[4:6, 2:4, 2:4] == 3).all()
     assert not (np.asarray(gone.map.classes_XYZ) == 3).any()
     assert (np.asarray(class_grid.observed(gone.map)) == 1).sum() == 8
+
+
+def test_a_row_that_is_added_leaves_the_others_as_they_are(tmp_path, monkeypatch):
+    """Long walks take hours: pieces are measured again only if their own inputs differ."""
+    (tmp_path / "revisit").mkdir()
+    manifest = tmp_path / "revisit" / voxel_report.MANIFEST
+    manifest.write_text("{}")
+    measured = []
+
+    def measure(config, params, episodes, long, key):
+        measured.append(key)
+        if key[0] == "unseen":
+            return dict.fromkeys(("iou", "prior", "places", "houses"), np.ones(()))
+        video = np.zeros((1, 6, 2, 2, 3), np.uint8)
+        return {
+            "video": video, "seen": np.ones(2), "doorways": np.zeros(2), "psnr": np.ones(()),
+            "count": np.ones(2),
+        }  # fmt: skip
+
+    walks = SimpleNamespace(walks=[0], truth=np.zeros((1, 6, 2, 2, 3), np.uint8))
+    monkeypatch.setattr(voxel_report, "_measure", measure)
+    monkeypatch.setattr(voxel_report, "_read_walks", lambda config: walks)
+    monkeypatch.setattr(
+        voxel_report, "open_run", lambda name: SimpleNamespace(weights_hash=name + "'s weights")
+    )
+    cache = ResultCache(tmp_path / "cache")
+
+    def score(**changes):
+        measured.clear()
+        chosen = dataclasses.replace(CONFIG.evaluate, long=str(tmp_path), long_frames=6, **changes)
+        config = dataclasses.replace(CONFIG, evaluate=chosen)
+        facts = voxel_report.score(config, {}, [], cache, print)
+        assert facts is not None
+        return sorted(measured), list(facts["rows"])
+
+    own = "as trained"
+    first, rows = score()
+    assert first == [("known", own), ("long", own), ("unseen", own)]
+    more, rows = score(mechanisms="on", beside=("small",))
+    assert ("beside", "small") in more
+    assert not {*first} & {*more}
+    assert rows == [*voxel_scores.MECHANISMS, "small"]
+    assert score(beside=("small", "other"))[0] == [("beside", "other")]
+    manifest.write_text("{ }")
+    assert score()[0] == [("long", own)]
+    monkeypatch.setattr(
+        voxel_report, "open_run", lambda name: SimpleNamespace(weights_hash="trained again")
+    )
+    assert score(beside=("small",))[0] == [("beside", "small")]
