@@ -87,7 +87,7 @@ def score(
     if not config.model.capabilities.voxels:
         return None
     settings = settings_of(config)
-    rows = list(MECHANISMS) if settings["mechanisms"] else [AS_TRAINED]
+    rows = voxel_scores.mechanisms(config) if settings["mechanisms"] else [AS_TRAINED]
     long = None
     if config.evaluate.long:
         long = _read_walks(config)

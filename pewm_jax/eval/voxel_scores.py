@@ -40,15 +40,22 @@ from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist import voxel_frames
 
 AS_TRAINED = "as trained"
-MECHANISMS: dict[str, dict[str, float]] = {
+MECHANISMS: dict[str, dict[str, Any]] = {
     AS_TRAINED: {},
-    "persistence_logit": {"persistence_logit": 0.0, "shown_logit": -1.0, "guess_logit": -1.0},
+    "persistence_logit": {
+        "persistence_logit": 0.0,
+        "shown_logit": -1.0,
+        "guess_logit": -1.0,
+        "sampled": "always",
+    },
     "empty_prior": {"empty_prior": 0.0},
     "observation_logit": {"observation_logit": 0.0},
     "guesses": {"shown_logit": -1.0, "guess_logit": -1.0},
+    "sampled": {"sampled": "always"},
 }
 """Rows: the settings of the world that switch a mechanism off. Without revision of guesses all
-known cells persist as observed ones do."""
+known cells persist as observed ones do. Without ``persistence_logit`` all voxels of every frame are
+sampled, since cells that are not sampled persist too."""
 KNOWN_FRAMES = 32
 """Most frames of a walk that are rendered from a known grid."""
 PRIOR_HOUSES = 64
@@ -67,6 +74,11 @@ SEEN_SHARE = 0.5
 def variant(config: Config, mechanism: str) -> Config:
     """Return the configuration with a mechanism of its world switched off; see ``MECHANISMS``."""
     return config.with_model(**MECHANISMS[mechanism])
+
+
+def mechanisms(config: Config) -> list[str]:
+    """Return the rows of a world: as trained, and without each mechanism that it has."""
+    return [name for name in MECHANISMS if name == AS_TRAINED or variant(config, name) != config]
 
 
 @dataclasses.dataclass(frozen=True)

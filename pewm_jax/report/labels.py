@@ -258,10 +258,11 @@ def format_steering(metrics: Mapping[str, Any]) -> list[str]:
 
 VOXEL_ROWS = {
     "as trained": "as trained",
-    "persistence_logit": "persistence_logit 0: known cells do not persist",
+    "persistence_logit": "persistence_logit 0, sampled in every frame",
     "empty_prior": "empty_prior 0",
-    "observation_logit": "observation_logit 0: images are no evidence",
+    "observation_logit": "observation_logit 0",
     "guesses": "guesses are not revised",
+    "sampled": "voxels are sampled in every frame",
 }
 """Labels of a voxel world's rows; other worlds have their names."""
 

@@ -24,7 +24,7 @@ from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.report import labels
 from pewm_jax.types import Camera, Frames, WorldState
 from pewm_jax.worlds.persist.config import PersistTrainConfig
-from tests.worlds.persist.tiny_persist import MASKED
+from tests.worlds.persist.tiny_persist import MASKED, MODEL
 
 CONFIG = Config(model=MASKED, train=PersistTrainConfig())
 
@@ -193,6 +193,16 @@ def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
     assert rows["observation_logit"].observation_logit == 0
     hold = config.model.persistence_logit
     assert rows["guesses"].kept_logits == (hold, hold, hold)
+    assert [rows[name].sampled for name in ("persistence_logit", "sampled")] == ["always"] * 2
+    assert [rows[name].sampled for name in ("empty_prior", "guesses")] == ["new"] * 2
+    assert voxel_scores.mechanisms(config) == list(rows)
+    # A mechanism that the world does not have gets no row.
+    published = dataclasses.replace(CONFIG, model=MODEL)
+    assert voxel_scores.mechanisms(published) == [
+        "as trained",
+        "persistence_logit",
+        "observation_logit",
+    ]
 
 
 FACTS = {
@@ -367,7 +377,7 @@ def test_a_row_that_is_added_leaves_the_others_as_they_are(tmp_path, monkeypatch
     more, rows = score(mechanisms="on", beside=("small",))
     assert ("beside", "small") in more
     assert not {*first} & {*more}
-    assert rows == [*voxel_scores.MECHANISMS, "small"]
+    assert rows == [*voxel_scores.mechanisms(CONFIG), "small"]
     assert score(beside=("small", "other"))[0] == [("beside", "other")]
     manifest.write_text("{ }")
     assert score()[0] == [("long", own)]
