@@ -65,6 +65,9 @@ def config() -> Config:
             clip=ClipConfig(frames=4, height=64, width=64),
             backbone=backbone,
             voxel_noise=voxels,
+            # An observed cell changes only if a real image shows another class.
+            persistence_logit=100.0,
+            observation_logit=200.0,
             shown_logit=8.0,
             guess_logit=2.0,
             sampled="new",

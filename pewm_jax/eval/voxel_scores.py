@@ -149,14 +149,15 @@ def compare_window(
 ) -> UnseenCells:
     """Return the recorded walls of a window, and which of its cells the observed frames show.
 
-    ``low_3`` and ``first_3`` place the window; by default it is that of a world which begins at
-    frame ``at`` of the episode.
+    ``seen`` are the observed frames, the present one, ``at``, last. ``low_3`` and ``first_3`` place
+    the window; by default it is that of a world that has observed ``seen``, whose lattice begins at
+    the first of them.
     """
     model, recorded = config.model, episode.voxels([at])
     if low_3 is None or first_3 is None:
-        position = np.asarray(episode.world_from_camera[at][:3, 3])
-        low_3 = np.asarray(model.memory.empty(model, position).low_3)
-        first_3 = np.asarray(windows.first_cell(model, low_3, position))
+        poses = np.asarray(seen.camera.world_from_camera)
+        low_3 = np.asarray(model.memory.empty(model, poses[0, :3, 3]).low_3)
+        first_3 = np.asarray(windows.first_cell(model, low_3, poses[-1, :3, 3]))
     off = np.round((low_3 - recorded.origin_T3[0]) / model.cell).astype(int) + first_3
     true = np.asarray(
         windows.cut_box(jnp.asarray(recorded.classes_TXYZ[0], jnp.int16), off, model.side)

@@ -23,6 +23,7 @@ from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.report import labels
 from pewm_jax.types import Camera, Frames, WorldState
+from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist.config import PersistTrainConfig
 from tests.worlds.persist.tiny_persist import MASKED, MODEL
 
@@ -121,7 +122,14 @@ def test_recorded_windows_agree_with_what_frames_show(episode):
     assert found.house == episode.scene
     assert found.unseen_XYZ.any()
     assert not found.unseen_XYZ.all()
-    fewer = voxel_scores.compare_window(CONFIG, episode, 11, jax.tree.map(lambda x: x[-1:], seen))
+    # The window is that of a world that began at the first of the frames.
+    began, now = (np.asarray(seen.camera.world_from_camera)[k, :3, 3] for k in (0, -1))
+    low = np.asarray(MASKED.memory.empty(MASKED, began).low_3)
+    window = low, np.asarray(windows.first_cell(MASKED, low, now))
+    same = voxel_scores.compare_window(CONFIG, episode, 11, seen, *window)
+    np.testing.assert_array_equal(found.wall_XYZ, same.wall_XYZ)
+    last = jax.tree.map(lambda x: x[-1:], seen)
+    fewer = voxel_scores.compare_window(CONFIG, episode, 11, last, *window)
     assert (fewer.unseen_XYZ | ~found.unseen_XYZ).all()
     assert fewer.unseen_XYZ.sum() > found.unseen_XYZ.sum()
     assert voxel_scores.house_of("scene0000_00") is None
