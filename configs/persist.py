@@ -15,7 +15,7 @@ def config() -> Config:
     """Return the settings of ``persist``.
 
     Its data: ``pewm-jax data collect data/persist_houses --moving --voxels --voxels.kinds groups
-    --voxels.colours 8 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 512
+    --voxels.colours 8 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 1024
     --validation 8 --test 16 --frames 64``. The codec of images is the one that comes with the
     library. Prepared clips are kept on disk, so that training can be spread over as many sittings
     as it takes.
@@ -78,7 +78,7 @@ def config() -> Config:
             stride_max=2,
             prepared=1440,
             prepared_path="data/persist_prepared",
-            refresh=8,
+            refresh=6,
         ),
         train=dataclasses.replace(
             base.train,
@@ -87,7 +87,7 @@ def config() -> Config:
                 steps=3000, batch=3, learning_rate=4e-3, warmup=50, optimizer="adam"
             ),
             voxel_statistics=StageConfig(steps=60, batch=8, learning_rate=0.05, warmup=0),
-            world_frames=StageConfig(steps=4000, batch=12, learning_rate=1.5e-3, warmup=50),
+            world_frames=StageConfig(steps=2400, batch=8, learning_rate=1.5e-3, warmup=50),
             camera=StageConfig(steps=200, batch=16, learning_rate=1e-3, warmup=20),
             renderer=StageConfig(steps=3000, batch=8, learning_rate=1.5e-3, warmup=50),
             new=10.0,
