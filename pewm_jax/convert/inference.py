@@ -33,7 +33,14 @@ from pewm_jax.data.dataset import read_manifest
 from pewm_jax.eval.evaluate import METRICS
 from pewm_jax.io import sources, tensor_files, tree, weights
 from pewm_jax.io.store import file_hash
-from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
+from pewm_jax.report.labels import (
+    MASK_NAMES,
+    METHOD_NAMES,
+    METRIC_NAMES,
+    format_voxels,
+    heading,
+    number,
+)
 from pewm_jax.train import runs
 from pewm_jax.types import Params
 from pewm_jax.worlds import rollouts
@@ -323,7 +330,8 @@ def _scores(metrics: Mapping[str, Any] | None, dtype: str | None) -> str:
         f"{', '.join(map(str, protocol['seeds']))}, {protocol['sampling_steps']} sampling steps, "
         f"protocol {protocol['fingerprint'][:12]}."
     )
-    return head + "\n".join(rows) + said
+    voxels = "".join(f"\n\n{line}" for line in format_voxels(metrics))
+    return head + "\n".join(rows) + said + voxels
 
 
 def _licence(facts: CardFacts) -> str:
