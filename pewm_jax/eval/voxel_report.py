@@ -164,10 +164,10 @@ def _measure(
 
 def _prior(config: Config) -> list[voxel_scores.UnseenCells]:
     """Return windows of the training split, or none if it is not there."""
-    try:
-        source = EpisodeSource(Path(config.data.path) / "train")
-    except UserError:
+    split = Path(config.data.path) / "train"
+    if not (split / MANIFEST).is_file():
         return []
+    source = EpisodeSource(split)
     count = min(len(source), voxel_scores.PRIOR_HOUSES)
     return voxel_scores.prior_places(config, [source[k] for k in range(count)])
 
