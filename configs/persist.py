@@ -84,7 +84,7 @@ def config() -> Config:
             base.train,
             run="runs/persist",
             voxel_vae=StageConfig(
-                steps=3000, batch=3, learning_rate=4e-3, warmup=50, optimizer="adam"
+                steps=2000, batch=3, learning_rate=4e-3, warmup=50, optimizer="adam"
             ),
             voxel_statistics=StageConfig(steps=60, batch=8, learning_rate=0.05, warmup=0),
             world_frames=StageConfig(steps=2400, batch=8, learning_rate=1.5e-3, warmup=50),
