@@ -175,10 +175,10 @@ def _observed(episode: Episode, at: int, context: int) -> Frames:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _shown(model: Any, corner_3: Array, depth_THW: Array, camera: Camera) -> Array:
-    """Return (X, Y, Z) bool: the cells of a window that any of the frames shows."""
+    """Return (X, Y, Z) bool: the cells of a window of which any frame shows at least a pixel."""
 
     def one(frame: tuple[Array, Camera]) -> Array:
-        air, surface = voxel_frames.visible_cells(model, corner_3, *frame)
+        air, surface = voxel_frames.visible_cells(model, corner_3, *frame, votes=1)
         return air | surface
 
     return jax.lax.map(one, (jnp.asarray(depth_THW), jax.tree.map(jnp.asarray, camera))).any(0)

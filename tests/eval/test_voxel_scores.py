@@ -156,6 +156,14 @@ def frames(count, value=0.0):
     return Frames(np.full((*shape, 3), value, np.float32), np.ones(shape, np.float32), camera)
 
 
+def test_a_cell_of_which_one_pixel_is_seen_is_not_unseen():
+    seen = frames(1)
+    depth = np.zeros((1, 16, 16), np.float32)
+    depth[0, 8, 8] = 1.0  # 1 m ahead of (3, 3, 1.25)
+    shown = np.asarray(voxel_scores._shown(MASKED, jnp.array([2.0, 1.0, 0.0]), depth, seen.camera))
+    assert shown[4, 3:5, 2].any()
+
+
 def test_points_count_as_shown_in_front_of_the_depth():
     seen = frames(1)
     points = np.array([[3.5, 3, 1.25], [4.5, 3, 1.25], [2.5, 3, 1.25]])
