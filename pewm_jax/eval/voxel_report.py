@@ -121,15 +121,21 @@ def _inputs(key: Key, settings: Mapping[str, Any]) -> list[Any]:
 
 
 def _read_walks(config: Config) -> _Walks:
-    """Read the long walks: one of each of the first ``evaluate.batch`` episodes."""
+    """Read the long walks: one of each of the first ``evaluate.batch`` episodes.
+
+    A walk starts where most doorways are seen open, as early as possible.
+    """
     chosen, context = config.evaluate, config.data.context
     source = EpisodeSource(Path(chosen.long) / chosen.split)
     count = min(len(source), chosen.batch)
     some = [source[k] for k in range(count)]
     require_same_cells(config.model, some[0])
-    at = context - 1
-    walks = [horizon.read_walk(one, at, chosen.long_frames, context) for one in some]
-    doorways = [voxel_scores.open_doorways(config, one, at, context) for one in some]
+    first, walks, doorways = context - 1, [], []
+    for one in some:
+        starts = range(first, max(one.length - chosen.long_frames, first + 1))
+        at = voxel_scores.most_doorways(config, one, starts, context)
+        walks.append(horizon.read_walk(one, at, chosen.long_frames, context))
+        doorways.append(voxel_scores.open_doorways(config, one, at, context))
     return _Walks(walks, doorways)
 
 

@@ -63,8 +63,9 @@ PRIOR_HOUSES = 64
 THRESHOLDS = np.linspace(0.02, 0.98, 49)
 LANE = 2
 """Cells of the width that a way through a doorway needs."""
-ABOVE_FLOOR_M, BELOW_HEAD_M = 0.1, 1.35
-"""Heights between which a way through a doorway must be free, metres."""
+SILL_CELLS, BELOW_HEAD_M = 1.25, 1.35
+"""A way through a doorway must be free from this height on, in cells, up to that one, metres: sills
+fill the lowest cells."""
 ACROSS_M = 0.25
 """Distance before and behind a doorway that must be free, too, metres."""
 SEEN_SHARE = 0.5
@@ -318,7 +319,7 @@ def way_through(rect: Sequence[float], floor_z: float, cell_m: float) -> np.ndar
     across = 1 - along
     lanes = np.arange(low[along] + cell_m / 2, high[along], cell_m)
     depth = np.arange(low[across] - ACROSS_M, high[across] + ACROSS_M + cell_m / 4, cell_m / 2)
-    height = np.arange(floor_z + ABOVE_FLOOR_M, floor_z + BELOW_HEAD_M, cell_m / 2)
+    height = np.arange(floor_z + SILL_CELLS * cell_m, floor_z + BELOW_HEAD_M, cell_m / 2)
     points = np.zeros((len(lanes), len(depth), len(height), 3))
     points[..., along] = lanes[:, None, None]
     points[..., across] = depth[:, None]
@@ -363,6 +364,12 @@ def open_doorways(config: Config, episode: Episode, at: int, context: int) -> li
             if shown.mean() >= SEEN_SHARE:
                 found.append(way)
     return found
+
+
+def most_doorways(config: Config, episode: Episode, starts: Sequence[int], context: int) -> int:
+    """Return the first of some frames before which most true doorways are seen open."""
+    counts = [len(open_doorways(config, episode, at, context)) for at in starts]
+    return starts[int(np.argmax(counts))]
 
 
 def _points_shown(seen: Frames, points: np.ndarray) -> np.ndarray:

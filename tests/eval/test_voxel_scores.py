@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import worlds
+from pewm_jax import presets, worlds
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
@@ -99,6 +99,7 @@ def test_a_doorway_is_passable_if_two_lanes_are_free():
     assert not voxel_scores.passable(config, grid, way)
     grid = blank()
     grid.classes_XYZ[:, :, 7] = 3  # a lintel above the head
+    grid.classes_XYZ[:, :, 0] = 3  # a sill
     assert voxel_scores.passable(config, grid, way)
     outside = voxel_scores.cells_at(grid, 0.25, np.array([[-1.0, 0, 0], [0.1, 0.1, 1.8]]))
     np.testing.assert_array_equal(outside, [-1, 3])
@@ -137,6 +138,30 @@ def test_recorded_windows_agree_with_what_frames_show(episode):
     assert house is not None
     for way in voxel_scores.open_doorways(CONFIG, episode, 11, 8):
         assert way.shape[-1] == 3
+
+
+@pytest.mark.slow
+def test_open_doorways_of_generated_houses_are_found():
+    """Houses have sills, and doors that open as the agent approaches."""
+    config = presets.load("persist")
+    voxels = VoxelsConfig(
+        record=True, cell=0.25, side=40, kinds="groups", colours=8, pictures="cells"
+    )
+    made = CollectConfig("data", train=3, frames=40, size=32, moving=True, voxels=voxels)
+    found = [read_episode(make_episode(made, "train", number)) for number in range(3)]
+    starts = [voxel_scores.most_doorways(config, one, range(7, 40), 8) for one in found]
+    counts = [
+        len(voxel_scores.open_doorways(config, one, at, 8))
+        for one, at in zip(found, starts, strict=True)
+    ]
+    assert sum(counts) >= 2
+
+
+def test_a_walk_begins_where_most_doorways_are_seen_open(monkeypatch):
+    seen = {7: 1, 8: 0, 9: 2, 10: 2}
+    monkeypatch.setattr(voxel_scores, "open_doorways", lambda c, e, at, n: [at] * seen[at])
+    assert voxel_scores.most_doorways(CONFIG, None, range(7, 11), 8) == 9  # type: ignore[arg-type]
+    assert voxel_scores.most_doorways(CONFIG, None, range(8, 9), 8) == 8  # type: ignore[arg-type]
 
 
 def pose(x, y, yaw):
