@@ -111,7 +111,8 @@ def plan(model: Any, episode: Episode, kind: str, *, beside: bool = False) -> Pl
     rooms = np.array([_room_at(house, xy) for xy in path[:, :2]])
     for place in _places(house, kind, floor, model.cell):
         inside = place.rooms[:1] if beside else place.rooms
-        found = _walk_to(episode, place, path, np.isin(rooms, (-1, *inside)))
+        not_from = np.isin(rooms, (-1, *inside))
+        found = _walk_to(episode, place, path, not_from, np.isin(rooms, place.rooms))
         if found is None:
             continue
         start, end = found
@@ -181,19 +182,24 @@ def _walls(house: Mapping[str, Any], floor_z: float, cell_m: float) -> Iterator[
 
 
 def _walk_to(
-    episode: Episode, place: _Place, path_T3: np.ndarray, inside_T: np.ndarray
+    episode: Episode,
+    place: _Place,
+    path_T3: np.ndarray,
+    not_from_T: np.ndarray,
+    inside_T: np.ndarray,
 ) -> tuple[int, int] | None:
     """Return the frame at which to edit and the last one: the first walk that shows the place.
 
-    ``inside_T`` is true at frames at which the place may not be edited.
+    ``not_from_T`` is true at frames at which the place may not be edited, ``inside_T`` at those in
+    its rooms, from which it is seen: a wall seen from behind belongs to another room, too.
     """
-    for seen in range(1, episode.length - 1):
+    for seen in np.flatnonzero(inside_T[1:-1]) + 1:
         if not _in_view(episode, seen, place.point_3):
             continue
         for start in range(max(seen - LONGEST, 0), seen):
             near = np.abs(place.point_3 - path_T3[start])[:2].max() <= REACH_M
-            if near and not inside_T[start] and not _is_shown(episode, start, place.point_3):
-                return start, min(seen + AFTER, episode.length - 1)
+            if near and not not_from_T[start] and not _is_shown(episode, start, place.point_3):
+                return start, min(int(seen) + AFTER, episode.length - 1)
     return None
 
 

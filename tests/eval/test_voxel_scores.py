@@ -360,6 +360,8 @@ def test_a_door_is_opened_from_a_third_room_if_any_walk_leads_from_one(monkeypat
     assert first([behind, third], "door")[0] is third  # type: ignore[list-item]
     assert first([beside, behind], "door")[0] is behind  # type: ignore[list-item]
     assert first([beside], "door") == (None, None)  # type: ignore[list-item]
+    # The wall of the next room is not seen from behind, which is a wall of the agent's own room.
+    assert voxel_edits.plan(MASKED, beside, "wall") is None  # type: ignore[arg-type]
 
 
 def test_an_edit_changes_the_box_alone():
