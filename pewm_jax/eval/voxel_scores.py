@@ -300,6 +300,7 @@ def _look_back(config: Config, params: Params, state: Any, camera: Camera, key: 
     return worlds.imagine(config.model, params, state, Control(camera), key)[1].rgb_THWC
 
 
+@functools.lru_cache(maxsize=64)
 def house_of(scene: str) -> Mapping[str, Any] | None:
     """Return rooms and doorways of a generated house by its name; None for other scenes."""
     # Imported here: meshes take a while to import, and other evaluations need none.
