@@ -1,8 +1,9 @@
 """Scores of a voxel world: unseen walls, a known grid, and what long walks do to what was seen.
 
 * **Unseen walls**: after some observed frames, the cells of the window that none of them shows are
-  compared with the recorded grid: the intersection over union of walls. The baseline is the prior:
-  the mean layout of other houses' windows, cut at the threshold that is best for it here.
+  compared with the recorded grid: the intersection over union of walls. The baselines are the
+  prior, which is the mean layout of other houses' windows, and the observed walls, widened by some
+  cells; the threshold and the number of cells are the best for them here.
 * **A known grid**: PSNR of the renderer given the recorded voxels and cameras.
 * **Long walks**: PSNR over the walk, FVD of all its windows of 16 frames. After it the camera is
   sent back to the observed frames: all pixels there were seen before, and the PSNR lost is that
@@ -23,6 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import ndimage
 
 from pewm_jax import worlds
 from pewm_jax.config import Config
@@ -61,6 +63,8 @@ KNOWN_FRAMES = 32
 PRIOR_HOUSES = 64
 """Most windows of other houses from which the mean layout is computed."""
 THRESHOLDS = np.linspace(0.02, 0.98, 49)
+WIDER = (1, 2, 3)
+"""Cells by which observed walls are widened, for a baseline."""
 LANE = 2
 """Cells of the width that a way through a doorway needs."""
 SILL_CELLS, BELOW_HEAD_M = 1.25, 1.35
@@ -216,10 +220,16 @@ def mean_layouts(
     return found
 
 
+def widened(cells: Sequence[UnseenCells]) -> float:
+    """Return the IoU of the observed walls, widened by the number of cells that is best here."""
+    seen = [one.wall_XYZ & ~one.unseen_XYZ for one in cells]
+    return max(iou(cells, [ndimage.binary_dilation(x, iterations=n) for x in seen]) for n in WIDER)
+
+
 def unseen_scores(
     cells: Sequence[UnseenCells], others: Sequence[UnseenCells] = ()
 ) -> dict[str, Any]:
-    """Return the IoU of unseen walls, and that of the mean layout at its best threshold."""
+    """Return the IoU of unseen walls, and those of the baselines at their best settings."""
     layouts = mean_layouts(cells, others)
     prior = max(iou(cells, [one >= cut for one in layouts]) for cut in THRESHOLDS)
     made = [one.made_XYZ for one in cells if one.made_XYZ is not None]
@@ -228,6 +238,7 @@ def unseen_scores(
         "houses": len({one.house for one in cells}),
         "iou": iou(cells, made),
         "prior": prior,
+        "widened": widened(cells),
         "prior_places": len(others) or len(cells),
     }
 
