@@ -190,8 +190,8 @@ def _walk_to(
 ) -> tuple[int, int] | None:
     """Return the frame at which to edit and the last one: the first walk that shows the place.
 
-    ``not_from_T`` is true at frames at which the place may not be edited, ``inside_T`` at those in
-    its rooms, from which it is seen: a wall seen from behind belongs to another room, too.
+    ``not_from_T`` is true at frames at which the place may not be edited. ``inside_T`` is true at
+    those in its rooms, from which it must be seen: the back of a wall belongs to another room.
     """
     for seen in np.flatnonzero(inside_T[1:-1]) + 1:
         if not _in_view(episode, seen, place.point_3):

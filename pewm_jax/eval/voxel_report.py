@@ -112,7 +112,7 @@ def score(
 
 
 def _inputs(key: Key, settings: Mapping[str, Any]) -> list[Any]:
-    """Return what a piece of work depends on, besides the protocol; no other row is among it."""
+    """Return what a piece of work depends on, besides the protocol; other rows do not matter."""
     piece, name = key
     inputs: list[Any] = [*key, MECHANISMS.get(name)]
     if piece in (LONG, BESIDE):
