@@ -24,7 +24,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import ndimage
 
 from pewm_jax import worlds
 from pewm_jax.config import Config
@@ -63,8 +62,8 @@ KNOWN_FRAMES = 32
 PRIOR_HOUSES = 64
 """Most windows of other houses from which the mean layout is computed."""
 THRESHOLDS = np.linspace(0.02, 0.98, 49)
-WIDER = (1, 2, 3)
-"""Cells by which observed walls are widened, for a baseline."""
+WIDEST = 3
+"""Most cells by which observed walls are widened, for a baseline."""
 LANE = 2
 """Cells of the width that a way through a doorway needs."""
 SILL_CELLS, BELOW_HEAD_M = 1.25, 1.35
@@ -222,8 +221,18 @@ def mean_layouts(
 
 def widened(cells: Sequence[UnseenCells]) -> float:
     """Return the IoU of the observed walls, widened by the number of cells that is best here."""
-    seen = [one.wall_XYZ & ~one.unseen_XYZ for one in cells]
-    return max(iou(cells, [ndimage.binary_dilation(x, iterations=n) for x in seen]) for n in WIDER)
+    walls, found = [one.wall_XYZ & ~one.unseen_XYZ for one in cells], []
+    for _ in range(WIDEST):
+        walls = [_widen(one) for one in walls]
+        found.append(iou(cells, walls))
+    return max(found)
+
+
+def _widen(cells_XYZ: np.ndarray) -> np.ndarray:
+    """Return cells and their six neighbours."""
+    wide = np.pad(cells_XYZ, 1)
+    beside = [np.roll(wide, step, axis) for axis in range(3) for step in (-1, 1)]
+    return np.any([wide, *beside], 0)[1:-1, 1:-1, 1:-1]
 
 
 def unseen_scores(
