@@ -193,13 +193,13 @@ def _walk_to(
     ``not_from_T`` is true at frames at which the place may not be edited. ``inside_T`` is true at
     those in its rooms, from which it must be seen: the back of a wall belongs to another room.
     """
-    for seen in np.flatnonzero(inside_T[1:-1]) + 1:
+    for seen in (np.flatnonzero(inside_T[1:-1]) + 1).tolist():
         if not _in_view(episode, seen, place.point_3):
             continue
         for start in range(max(seen - LONGEST, 0), seen):
             near = np.abs(place.point_3 - path_T3[start])[:2].max() <= REACH_M
             if near and not not_from_T[start] and not _is_shown(episode, start, place.point_3):
-                return start, min(int(seen) + AFTER, episode.length - 1)
+                return start, min(seen + AFTER, episode.length - 1)
     return None
 
 

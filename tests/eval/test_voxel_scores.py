@@ -170,8 +170,8 @@ def test_open_doorways_of_generated_houses_are_found():
 def test_a_walk_begins_where_most_doorways_are_seen_open(monkeypatch):
     seen = {7: 1, 8: 0, 9: 2, 10: 2}
     monkeypatch.setattr(voxel_scores, "open_doorways", lambda c, e, at, n: [at] * seen[at])
-    assert voxel_scores.most_doorways(CONFIG, None, range(7, 11), 8) == 9  # type: ignore[arg-type]
-    assert voxel_scores.most_doorways(CONFIG, None, range(8, 9), 8) == 8  # type: ignore[arg-type]
+    assert voxel_scores.most_doorways(CONFIG, None, range(7, 11), 8) == 9
+    assert voxel_scores.most_doorways(CONFIG, None, range(8, 9), 8) == 8
 
 
 def pose(x, y, yaw):
@@ -368,11 +368,11 @@ def test_a_door_is_opened_from_a_third_room_if_any_walk_leads_from_one(monkeypat
     assert found is not None
     assert behind.world_from_camera[found.start][0, 3] > 6.2
     first = functools.partial(voxel_edits.first_plan, MASKED)
-    assert first([behind, third], "door")[0] is third  # type: ignore[list-item]
-    assert first([beside, behind], "door")[0] is behind  # type: ignore[list-item]
-    assert first([beside], "door") == (None, None)  # type: ignore[list-item]
+    assert first([behind, third], "door")[0] is third
+    assert first([beside, behind], "door")[0] is behind
+    assert first([beside], "door") == (None, None)
     # The wall of the next room is not seen from behind, which is a wall of the agent's own room.
-    assert voxel_edits.plan(MASKED, beside, "wall") is None  # type: ignore[arg-type]
+    assert voxel_edits.plan(MASKED, beside, "wall") is None
 
 
 def test_an_edit_changes_the_box_alone():
