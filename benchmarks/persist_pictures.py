@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -204,11 +203,10 @@ def edits(settings: Settings, model, params, episodes, imagine) -> None:
     """Write a video and a strip for each kind of edit, ``edit_wall.mp4`` and so on."""
     start = jax.jit(persist.start_in, static_argnums=0)
     for kind in voxel_edits.KINDS:
-        found = next(_planned(model, episodes, kind), None)
-        if found is None:
+        episode, plan = voxel_edits.first_plan(model, episodes, kind)
+        if episode is None or plan is None:
             print(f"{kind}: no walk leads from another room to one; collect more episodes.")
             continue
-        episode, plan = found
         frames, known = _given(episode, plan.start)
         plain = start(model, params, frames, *known)
         changed = voxel_edits.apply(model, plain, plan)
@@ -232,14 +230,6 @@ def edits(settings: Settings, model, params, episodes, imagine) -> None:
         rows = [(name, [film[t] for t in shown]) for name, film in films]
         _save(settings.out / f"edit_{kind}.png", rows, [f"{t}" for t in shown])
         print(f"{kind}: {episode.name}, frames {plan.start} to {plan.end}, {plan.about}")
-
-
-def _planned(model, episodes, kind: str) -> Iterator[tuple[Episode, voxel_edits.Plan]]:
-    """Yield the episodes in which an edit of a kind can be shown, in order."""
-    for number in range(len(episodes)):
-        plan = voxel_edits.plan(model, episodes[number], kind)
-        if plan is not None:
-            yield episodes[number], plan
 
 
 def _given(episode: Episode, frame: int):

@@ -15,7 +15,7 @@ def config() -> Config:
     """Return the settings of ``persist``.
 
     Its data: ``pewm-jax data collect data/persist_houses --moving --voxels --voxels.kinds groups
-    --voxels.colours 8 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 512
+    --voxels.colours 8 --voxels.pictures cells --voxels.cell 0.25 --voxels.side 40 --train 1024
     --validation 8 --test 16 --frames 64``. The codec of images is the one that comes with the
     library. Prepared clips are kept on disk, so that training can be spread over as many sittings
     as it takes.
@@ -65,6 +65,9 @@ def config() -> Config:
             clip=ClipConfig(frames=4, height=64, width=64),
             backbone=backbone,
             voxel_noise=voxels,
+            # An observed cell changes only if a real image shows another class.
+            persistence_logit=100.0,
+            observation_logit=200.0,
             shown_logit=8.0,
             guess_logit=2.0,
             sampled="new",
@@ -75,18 +78,18 @@ def config() -> Config:
             stride_max=2,
             prepared=1440,
             prepared_path="data/persist_prepared",
-            refresh=8,
+            refresh=6,
         ),
         train=dataclasses.replace(
             base.train,
             run="runs/persist",
             voxel_vae=StageConfig(
-                steps=4000, batch=4, learning_rate=4e-3, warmup=50, optimizer="adam"
+                steps=2000, batch=3, learning_rate=4e-3, warmup=50, optimizer="adam"
             ),
             voxel_statistics=StageConfig(steps=60, batch=8, learning_rate=0.05, warmup=0),
-            world_frames=StageConfig(steps=4500, batch=12, learning_rate=1.5e-3, warmup=50),
+            world_frames=StageConfig(steps=2400, batch=8, learning_rate=1.5e-3, warmup=50),
             camera=StageConfig(steps=200, batch=16, learning_rate=1e-3, warmup=20),
-            renderer=StageConfig(steps=4000, batch=8, learning_rate=1.5e-3, warmup=50),
+            renderer=StageConfig(steps=3000, batch=8, learning_rate=1.5e-3, warmup=50),
             new=10.0,
             occupied=3.0,
             classes=1.0,

@@ -343,7 +343,8 @@ def _scores(metrics: Mapping[str, Any] | None, dtype: str | None) -> str:
         f"{', '.join(map(str, protocol['seeds']))}, {protocol['sampling_steps']} sampling steps, "
         f"protocol {protocol['fingerprint'][:12]}."
     )
-    return head + "\n".join(rows) + said
+    voxels = "".join(f"\n\n{line}" for line in labels.format_voxels(metrics))
+    return head + "\n".join(rows) + said + voxels
 
 
 def _steering(metrics: Mapping[str, Any] | None) -> list[str]:

@@ -152,7 +152,9 @@ def imagine_actions(
     model = config.model
     each = CHUNK if memory else model.clip.frames - 1
     imagine = functools.partial(worlds.imagine, model, memory=memory)
-    imagine = jax.jit(jax.vmap(imagine, (None, 0, 0, 0)))
+    # A batch would sample the voxels of every frame, whether cells are new in it or not.
+    one_by_one = getattr(model, "sampled", "always") == "new"
+    imagine = jax.jit(_mapped(imagine) if one_by_one else jax.vmap(imagine, (None, 0, 0, 0)))
     keys = jax.random.split(jax.random.key(0), len(actions_BT3))
     return _in_chunks(
         actions_BT3.shape[1],
@@ -232,6 +234,15 @@ def distances(
                     kind: metric.score(seen, true).facts() for kind, metric in kinds.items()
                 }
     return found
+
+
+def _mapped(imagine: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of the same arguments with a leading B, which maps one after the other."""
+
+    def mapped(params: Params, *batch: Any) -> Any:
+        return jax.lax.map(lambda one: imagine(params, *one), batch)
+
+    return mapped
 
 
 def _in_chunks(

@@ -1,14 +1,14 @@
 """Plan edits of a generated house that a recorded walk reaches from another room.
 
 An edit is made while the agent is in another room than the edited one: a wall is moved, a door
-opened, or a chair removed. The walk then leads to where the edit can be seen. Episodes and frames
-are the first ones that fit, so nothing is selected by how a world draws it.
+opened, or a chair removed. The place is not in view then; the walk leads to where it can be seen.
+Episodes and frames are the first ones that fit, so nothing is selected by how a world draws it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -81,10 +81,27 @@ def apply(model: Any, state: WorldState, plan: Plan) -> WorldState:
     return persist.edit(state, class_grid.move, model.memory, box, plan.move.astype(np.float32))
 
 
-def plan(model: Any, episode: Episode, kind: str) -> Plan | None:
+def first_plan(
+    model: Any, episodes: Sequence[Episode], kind: str
+) -> tuple[Episode, Plan] | tuple[None, None]:
+    """Return the first episode in which an edit of a kind can be shown, and the edit.
+
+    An edit of a door from one of its own two rooms is returned only if no episode has one from a
+    third room.
+    """
+    for beside in (False, True) if kind == "door" else (False,):
+        for number in range(len(episodes)):
+            found = plan(model, episodes[number], kind, beside=beside)
+            if found is not None:
+                return episodes[number], found
+    return None, None
+
+
+def plan(model: Any, episode: Episode, kind: str, *, beside: bool = False) -> Plan | None:
     """Return the first edit of a kind that a walk reaches from another room; None if there is none.
 
-    The episode must have voxels and actions; scenes other than generated houses have no plan.
+    The episode must have voxels and actions; scenes other than generated houses have no plan. A
+    door belongs to both its rooms; with ``beside`` the edit may be made from its second room.
     """
     house = house_of(episode.scene)
     if house is None or episode.actions is None:
@@ -93,7 +110,9 @@ def plan(model: Any, episode: Episode, kind: str) -> Plan | None:
     path = np.asarray(episode.world_from_camera)[:, :3, 3]
     rooms = np.array([_room_at(house, xy) for xy in path[:, :2]])
     for place in _places(house, kind, floor, model.cell):
-        found = _walk_to(episode, place, path, rooms)
+        inside = place.rooms[:1] if beside else place.rooms
+        not_from = np.isin(rooms, (-1, *inside))
+        found = _walk_to(episode, place, path, not_from, np.isin(rooms, place.rooms))
         if found is None:
             continue
         start, end = found
@@ -163,35 +182,50 @@ def _walls(house: Mapping[str, Any], floor_z: float, cell_m: float) -> Iterator[
 
 
 def _walk_to(
-    episode: Episode, place: _Place, path_T3: np.ndarray, rooms_T: np.ndarray
+    episode: Episode,
+    place: _Place,
+    path_T3: np.ndarray,
+    not_from_T: np.ndarray,
+    inside_T: np.ndarray,
 ) -> tuple[int, int] | None:
-    """Return the frame at which to edit and the last one: the first walk that shows the place."""
-    for seen in range(1, episode.length - 1):
+    """Return the frame at which to edit and the last one: the first walk that shows the place.
+
+    ``not_from_T`` is true at frames at which the place may not be edited. ``inside_T`` is true at
+    those in its rooms, from which it must be seen: the back of a wall belongs to another room.
+    """
+    for seen in (np.flatnonzero(inside_T[1:-1]) + 1).tolist():
         if not _in_view(episode, seen, place.point_3):
             continue
-        elsewhere = [
-            t for t in range(max(seen - LONGEST, 0), seen)
-            if rooms_T[t] >= 0 and rooms_T[t] not in place.rooms[:1]
-            and np.abs(place.point_3 - path_T3[t])[:2].max() <= REACH_M
-            and not _in_view(episode, t, place.point_3)
-        ]  # fmt: skip
-        if elsewhere:
-            return elsewhere[-1], min(seen + AFTER, episode.length - 1)
+        for start in range(max(seen - LONGEST, 0), seen):
+            near = np.abs(place.point_3 - path_T3[start])[:2].max() <= REACH_M
+            if near and not not_from_T[start] and not _is_shown(episode, start, place.point_3):
+                return start, min(seen + AFTER, episode.length - 1)
     return None
 
 
 def _in_view(episode: Episode, frame: int, point_3: np.ndarray) -> bool:
-    """Return whether a frame shows a point: it is near, ahead, and nothing stands before it."""
-    pose = np.asarray(episode.world_from_camera[frame], np.float64)
-    x, y, z = (point_3 - pose[:3, 3]) @ pose[:3, :3]
-    if not NEAR_M <= z <= FAR_M or abs(x) > ASIDE * z:
+    """Return whether a frame shows a point near the middle of the image, from nearby."""
+    x, _, z = _seen_from(episode, frame, point_3)
+    return NEAR_M <= z <= FAR_M and abs(x) <= ASIDE * z and _is_shown(episode, frame, point_3)
+
+
+def _is_shown(episode: Episode, frame: int, point_3: np.ndarray) -> bool:
+    """Return whether a point is in a frame's image and nothing stands before it."""
+    x, y, z = _seen_from(episode, frame, point_3)
+    if z <= 0:
         return False
     fx, fy, cx, cy = episode.intrinsics_4
-    column, row = int(x / z * fx + cx), int(y / z * fy + cy)
+    column, row = np.floor([x / z * fx + cx, y / z * fy + cy])
     if not (0 <= column < episode.width and 0 <= row < episode.height):
         return False
-    depth = episode.frames([frame]).depth_THW[0]
-    return bool(abs(depth[row, column] - z) < AGREES_M)
+    depth = episode.frames([frame]).depth_THW[0, int(row), int(column)]
+    return bool(abs(depth - z) < AGREES_M)
+
+
+def _seen_from(episode: Episode, frame: int, point_3: np.ndarray) -> np.ndarray:
+    """Return a point in the coordinates of a frame's camera, metres."""
+    pose = np.asarray(episode.world_from_camera[frame], np.float64)
+    return (point_3 - pose[:3, 3]) @ pose[:3, :3]
 
 
 def _is_clear(place: _Place, path_T3: np.ndarray) -> bool:

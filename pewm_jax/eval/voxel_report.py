@@ -87,7 +87,7 @@ def score(
     if not config.model.capabilities.voxels:
         return None
     settings = settings_of(config)
-    rows = list(MECHANISMS) if settings["mechanisms"] else [AS_TRAINED]
+    rows = voxel_scores.mechanisms(config) if settings["mechanisms"] else [AS_TRAINED]
     long = None
     if config.evaluate.long:
         long = _read_walks(config)
@@ -102,7 +102,7 @@ def score(
 
     found = map_resumable(
         keys,
-        lambda key: f"voxels-{key[0]}-{inputs_hash([key, settings])[:16]}",
+        lambda key: f"voxels-{key[0]}-{inputs_hash(_inputs(key, settings))[:16]}",
         work,
         cache=cache,
         what="voxels",
@@ -111,16 +111,31 @@ def score(
     return _facts(config, long, found, rows, i3d)
 
 
+def _inputs(key: Key, settings: Mapping[str, Any]) -> list[Any]:
+    """Return what a piece of work depends on, besides the protocol; other rows do not matter."""
+    piece, name = key
+    inputs: list[Any] = [*key, MECHANISMS.get(name)]
+    if piece in (LONG, BESIDE):
+        inputs += [settings["long_sha256"], settings["frames"]]
+    return [*inputs, settings["beside"][name]] if piece == BESIDE else inputs
+
+
 def _read_walks(config: Config) -> _Walks:
-    """Read the long walks: one of each of the first ``evaluate.batch`` episodes."""
+    """Read the long walks: one of each of the first ``evaluate.batch`` episodes.
+
+    A walk starts where most doorways are seen open, as early as possible.
+    """
     chosen, context = config.evaluate, config.data.context
     source = EpisodeSource(Path(chosen.long) / chosen.split)
     count = min(len(source), chosen.batch)
     some = [source[k] for k in range(count)]
     require_same_cells(config.model, some[0])
-    at = context - 1
-    walks = [horizon.read_walk(one, at, chosen.long_frames, context) for one in some]
-    doorways = [voxel_scores.open_doorways(config, one, at, context) for one in some]
+    first, walks, doorways = context - 1, [], []
+    for one in some:
+        starts = range(first, max(one.length - chosen.long_frames, first + 1))
+        at = voxel_scores.most_doorways(config, one, starts, context)
+        walks.append(horizon.read_walk(one, at, chosen.long_frames, context))
+        doorways.append(voxel_scores.open_doorways(config, one, at, context))
     return _Walks(walks, doorways)
 
 
@@ -155,10 +170,10 @@ def _measure(
 
 def _prior(config: Config) -> list[voxel_scores.UnseenCells]:
     """Return windows of the training split, or none if it is not there."""
-    try:
-        source = EpisodeSource(Path(config.data.path) / "train")
-    except UserError:
+    split = Path(config.data.path) / "train"
+    if not (split / MANIFEST).is_file():
         return []
+    source = EpisodeSource(split)
     count = min(len(source), voxel_scores.PRIOR_HOUSES)
     return voxel_scores.prior_places(config, [source[k] for k in range(count)])
 

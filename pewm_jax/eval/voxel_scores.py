@@ -1,8 +1,9 @@
 """Scores of a voxel world: unseen walls, a known grid, and what long walks do to what was seen.
 
 * **Unseen walls**: after some observed frames, the cells of the window that none of them shows are
-  compared with the recorded grid: the intersection over union of walls. The baseline is the prior:
-  the mean layout of other houses' windows, cut at the threshold that is best for it here.
+  compared with the recorded grid: the intersection over union of walls. The baselines are the
+  prior, which is the mean layout of other houses' windows, and the observed walls, widened by some
+  cells; the threshold and the number of cells are the best for them here.
 * **A known grid**: PSNR of the renderer given the recorded voxels and cameras.
 * **Long walks**: PSNR over the walk, FVD of all its windows of 16 frames. After it the camera is
   sent back to the observed frames: all pixels there were seen before, and the PSNR lost is that
@@ -40,24 +41,34 @@ from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist import voxel_frames
 
 AS_TRAINED = "as trained"
-MECHANISMS: dict[str, dict[str, float]] = {
+MECHANISMS: dict[str, dict[str, Any]] = {
     AS_TRAINED: {},
-    "persistence_logit": {"persistence_logit": 0.0, "shown_logit": -1.0, "guess_logit": -1.0},
+    "persistence_logit": {
+        "persistence_logit": 0.0,
+        "shown_logit": -1.0,
+        "guess_logit": -1.0,
+        "sampled": "always",
+    },
     "empty_prior": {"empty_prior": 0.0},
     "observation_logit": {"observation_logit": 0.0},
     "guesses": {"shown_logit": -1.0, "guess_logit": -1.0},
+    "sampled": {"sampled": "always"},
 }
 """Rows: the settings of the world that switch a mechanism off. Without revision of guesses all
-known cells persist as observed ones do."""
+known cells persist as observed ones do. Without ``persistence_logit`` all voxels of every frame are
+sampled, since cells that are not sampled persist too."""
 KNOWN_FRAMES = 32
 """Most frames of a walk that are rendered from a known grid."""
 PRIOR_HOUSES = 64
 """Most windows of other houses from which the mean layout is computed."""
 THRESHOLDS = np.linspace(0.02, 0.98, 49)
+WIDEST = 3
+"""Most cells by which observed walls are widened, for a baseline."""
 LANE = 2
 """Cells of the width that a way through a doorway needs."""
-ABOVE_FLOOR_M, BELOW_HEAD_M = 0.1, 1.35
-"""Heights between which a way through a doorway must be free, metres."""
+SILL_CELLS, BELOW_HEAD_M = 1.25, 1.35
+"""A way through a doorway must be free from this height on, in cells, up to that one, metres: sills
+fill the lowest cells."""
 ACROSS_M = 0.25
 """Distance before and behind a doorway that must be free, too, metres."""
 SEEN_SHARE = 0.5
@@ -67,6 +78,11 @@ SEEN_SHARE = 0.5
 def variant(config: Config, mechanism: str) -> Config:
     """Return the configuration with a mechanism of its world switched off; see ``MECHANISMS``."""
     return config.with_model(**MECHANISMS[mechanism])
+
+
+def mechanisms(config: Config) -> list[str]:
+    """Return the rows of a world: as trained, and without each mechanism that it has."""
+    return [name for name in MECHANISMS if name == AS_TRAINED or variant(config, name) != config]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,14 +153,15 @@ def compare_window(
 ) -> UnseenCells:
     """Return the recorded walls of a window, and which of its cells the observed frames show.
 
-    ``low_3`` and ``first_3`` place the window; by default it is that of a world which begins at
-    frame ``at`` of the episode.
+    ``seen`` are the observed frames, the present one, ``at``, last. ``low_3`` and ``first_3`` place
+    the window; by default it is that of a world that has observed ``seen``, whose lattice begins at
+    the first of them.
     """
     model, recorded = config.model, episode.voxels([at])
     if low_3 is None or first_3 is None:
-        position = np.asarray(episode.world_from_camera[at][:3, 3])
-        low_3 = np.asarray(model.memory.empty(model, position).low_3)
-        first_3 = np.asarray(windows.first_cell(model, low_3, position))
+        poses = np.asarray(seen.camera.world_from_camera)
+        low_3 = np.asarray(model.memory.empty(model, poses[0, :3, 3]).low_3)
+        first_3 = np.asarray(windows.first_cell(model, low_3, poses[-1, :3, 3]))
     off = np.round((low_3 - recorded.origin_T3[0]) / model.cell).astype(int) + first_3
     true = np.asarray(
         windows.cut_box(jnp.asarray(recorded.classes_TXYZ[0], jnp.int16), off, model.side)
@@ -162,10 +179,10 @@ def _observed(episode: Episode, at: int, context: int) -> Frames:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _shown(model: Any, corner_3: Array, depth_THW: Array, camera: Camera) -> Array:
-    """Return (X, Y, Z) bool: the cells of a window that any of the frames shows."""
+    """Return (X, Y, Z) bool: the cells of a window of which any frame shows at least a pixel."""
 
     def one(frame: tuple[Array, Camera]) -> Array:
-        air, surface = voxel_frames.visible_cells(model, corner_3, *frame)
+        air, surface = voxel_frames.visible_cells(model, corner_3, *frame, votes=1)
         return air | surface
 
     return jax.lax.map(one, (jnp.asarray(depth_THW), jax.tree.map(jnp.asarray, camera))).any(0)
@@ -202,10 +219,26 @@ def mean_layouts(
     return found
 
 
+def widened(cells: Sequence[UnseenCells]) -> float:
+    """Return the IoU of the observed walls, widened by the number of cells that is best here."""
+    walls, found = [one.wall_XYZ & ~one.unseen_XYZ for one in cells], []
+    for _ in range(WIDEST):
+        walls = [_widen(one) for one in walls]
+        found.append(iou(cells, walls))
+    return max(found)
+
+
+def _widen(cells_XYZ: np.ndarray) -> np.ndarray:
+    """Return cells and their six neighbours."""
+    wide = np.pad(cells_XYZ, 1)
+    beside = [np.roll(wide, step, axis) for axis in range(3) for step in (-1, 1)]
+    return np.any([wide, *beside], 0)[1:-1, 1:-1, 1:-1]
+
+
 def unseen_scores(
     cells: Sequence[UnseenCells], others: Sequence[UnseenCells] = ()
 ) -> dict[str, Any]:
-    """Return the IoU of unseen walls, and that of the mean layout at its best threshold."""
+    """Return the IoU of unseen walls, and those of the baselines at their best settings."""
     layouts = mean_layouts(cells, others)
     prior = max(iou(cells, [one >= cut for one in layouts]) for cut in THRESHOLDS)
     made = [one.made_XYZ for one in cells if one.made_XYZ is not None]
@@ -214,6 +247,7 @@ def unseen_scores(
         "houses": len({one.house for one in cells}),
         "iou": iou(cells, made),
         "prior": prior,
+        "widened": widened(cells),
         "prior_places": len(others) or len(cells),
     }
 
@@ -286,6 +320,7 @@ def _look_back(config: Config, params: Params, state: Any, camera: Camera, key: 
     return worlds.imagine(config.model, params, state, Control(camera), key)[1].rgb_THWC
 
 
+@functools.lru_cache(maxsize=64)
 def house_of(scene: str) -> Mapping[str, Any] | None:
     """Return rooms and doorways of a generated house by its name; None for other scenes."""
     # Imported here: meshes take a while to import, and other evaluations need none.
@@ -305,7 +340,7 @@ def way_through(rect: Sequence[float], floor_z: float, cell_m: float) -> np.ndar
     across = 1 - along
     lanes = np.arange(low[along] + cell_m / 2, high[along], cell_m)
     depth = np.arange(low[across] - ACROSS_M, high[across] + ACROSS_M + cell_m / 4, cell_m / 2)
-    height = np.arange(floor_z + ABOVE_FLOOR_M, floor_z + BELOW_HEAD_M, cell_m / 2)
+    height = np.arange(floor_z + SILL_CELLS * cell_m, floor_z + BELOW_HEAD_M, cell_m / 2)
     points = np.zeros((len(lanes), len(depth), len(height), 3))
     points[..., along] = lanes[:, None, None]
     points[..., across] = depth[:, None]
@@ -350,6 +385,12 @@ def open_doorways(config: Config, episode: Episode, at: int, context: int) -> li
             if shown.mean() >= SEEN_SHARE:
                 found.append(way)
     return found
+
+
+def most_doorways(config: Config, episode: Episode, starts: Sequence[int], context: int) -> int:
+    """Return the first of some frames before which most true doorways are seen open."""
+    counts = [len(open_doorways(config, episode, at, context)) for at in starts]
+    return starts[int(np.argmax(counts))]
 
 
 def _points_shown(seen: Frames, points: np.ndarray) -> np.ndarray:

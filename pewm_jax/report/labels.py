@@ -283,10 +283,11 @@ def compare_steering(found: Mapping[str, Any]) -> list[str]:
 
 VOXEL_ROWS = {
     "as trained": "as trained",
-    "persistence_logit": "persistence_logit 0: known cells do not persist",
+    "persistence_logit": "persistence_logit 0, sampled in every frame",
     "empty_prior": "empty_prior 0",
-    "observation_logit": "observation_logit 0: images are no evidence",
+    "observation_logit": "observation_logit 0",
     "guesses": "guesses are not revised",
+    "sampled": "voxels are sampled in every frame",
 }
 """Labels of a voxel world's rows; other worlds have their names."""
 
@@ -321,8 +322,9 @@ def format_voxels(metrics: Mapping[str, Any]) -> list[str]:
     ratio = f" ({unseen['iou'] / unseen['prior']:.2f} times)" if unseen["prior"] else ""
     walls = (
         f"IoU of walls that no observed frame shows: {unseen['iou']:.3f}; of the mean layout of "
-        f"other houses {unseen['prior']:.3f}{ratio}, at {unseen['places']:.0f} places in "
-        f"{unseen['houses']:.0f} houses."
+        f"other houses {unseen['prior']:.3f}{ratio}; of the observed walls, widened, "
+        f"{unseen['widened']:.3f}; at {unseen['places']:.0f} places in {unseen['houses']:.0f} "
+        "houses."
     )
     said = [walls, f"PSNR of rendering a known grid: {known['psnr']:.2f} dB."]
     own = found["rows"]["as trained"]

@@ -46,7 +46,8 @@ class Stage:
         prepare: ``prepare(model, params, clip) -> clip``: computes beforehand the parts of the loss
             that depend on frozen weights alone, and drops arrays that are then unused; the loss is
             the same.
-        prepares_by: the top-level parameters that ``prepare`` reads.
+        prepares_by: the top-level parameters that ``prepare`` reads. Further names only keep
+            prepared clips on disk apart from those of other stages.
         extra_weights: ``extra_weights(model, train) -> params`` or None: weights that the loss
             needs and that are not part of the model, under top-level names of their own. They are
             read when training starts, placed on every device, never trained and never saved.

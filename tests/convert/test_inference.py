@@ -104,8 +104,15 @@ def test_the_card_tells_base_licence_data_and_scores(run, tmp_path):
     (run / "report").mkdir()
     metrics = json.loads(json.dumps(METRICS))
     metrics["protocol"]["weights_sha256"] = file_hash(run / runs.WEIGHTS)
+    metrics["voxels"] = {
+        "unseen": {"iou": 0.3, "prior": 0.12, "widened": 0.19, "places": 24, "houses": 16},
+        "known": {"psnr": 22.5},
+        "long": None,
+        "rows": {"as trained": {"iou": 0.3}},
+    }
     (run / "report" / "metrics.json").write_text(json.dumps(metrics))
     card = export(run, tmp_path / "full")
+    assert "PSNR of rendering a known grid: 22.50 dB." in card  # of a world of voxels
     assert "Made from `CogVideoX-5b`, whose licence is: cogvideox (https://example.org)." in card
     assert json.loads((tmp_path / "full" / runs.BASE).read_text()) == record
     assert "| seen before | with its map | 12.25 |" in card

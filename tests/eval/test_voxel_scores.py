@@ -1,6 +1,7 @@
 """Scores of voxel worlds: unseen walls, doorways, what is lost, and how they are reported."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import worlds
+from pewm_jax import presets, worlds
 from pewm_jax.config import Config, UserError
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
@@ -17,12 +18,14 @@ from pewm_jax.eval import horizon, voxel_edits, voxel_report, voxel_scores
 from pewm_jax.eval.voxel_scores import UnseenCells
 from pewm_jax.houses.generate import object_boxes
 from pewm_jax.houses.kinds import FURNITURE, kind_of
+from pewm_jax.io.store import ResultCache
 from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import ClassGrid
 from pewm_jax.report import labels
 from pewm_jax.types import Camera, Frames, WorldState
+from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist.config import PersistTrainConfig
-from tests.worlds.persist.tiny_persist import MASKED
+from tests.worlds.persist.tiny_persist import MASKED, MODEL
 
 CONFIG = Config(model=MASKED, train=PersistTrainConfig())
 
@@ -63,6 +66,16 @@ def test_the_prior_is_the_mean_layout_of_other_houses_at_its_best_threshold():
     assert voxel_scores.unseen_scores(some, others)["prior"] == 12 / 14  # cut above one half
 
 
+def test_observed_walls_are_widened_as_a_baseline():
+    wall = np.zeros((9, 9, 9), bool)
+    wall[:4] = True
+    unseen = np.ones((9, 9, 9), bool)
+    unseen[:2] = False  # the walls behind those that are seen
+    assert voxel_scores.widened([cells("a", wall, wall, unseen)]) == 1
+    unseen[:4] = False
+    assert voxel_scores.widened([cells("a", wall, wall, unseen)]) == 0
+
+
 def test_walls_are_classes_of_walls_in_any_colour():
     names = ("empty", "wall/red", "door/red", "trim", "sofa/blue", "doorway/blue")
     assert voxel_scores.wall_classes(names).tolist() == [False, True, False, True, False, True]
@@ -96,6 +109,7 @@ def test_a_doorway_is_passable_if_two_lanes_are_free():
     assert not voxel_scores.passable(config, grid, way)
     grid = blank()
     grid.classes_XYZ[:, :, 7] = 3  # a lintel above the head
+    grid.classes_XYZ[:, :, 0] = 3  # a sill
     assert voxel_scores.passable(config, grid, way)
     outside = voxel_scores.cells_at(grid, 0.25, np.array([[-1.0, 0, 0], [0.1, 0.1, 1.8]]))
     np.testing.assert_array_equal(outside, [-1, 3])
@@ -119,7 +133,14 @@ def test_recorded_windows_agree_with_what_frames_show(episode):
     assert found.house == episode.scene
     assert found.unseen_XYZ.any()
     assert not found.unseen_XYZ.all()
-    fewer = voxel_scores.compare_window(CONFIG, episode, 11, jax.tree.map(lambda x: x[-1:], seen))
+    # The window is that of a world that began at the first of the frames.
+    began, now = (np.asarray(seen.camera.world_from_camera)[k, :3, 3] for k in (0, -1))
+    low = np.asarray(MASKED.memory.empty(MASKED, began).low_3)
+    window = low, np.asarray(windows.first_cell(MASKED, low, now))
+    same = voxel_scores.compare_window(CONFIG, episode, 11, seen, *window)
+    np.testing.assert_array_equal(found.wall_XYZ, same.wall_XYZ)
+    last = jax.tree.map(lambda x: x[-1:], seen)
+    fewer = voxel_scores.compare_window(CONFIG, episode, 11, last, *window)
     assert (fewer.unseen_XYZ | ~found.unseen_XYZ).all()
     assert fewer.unseen_XYZ.sum() > found.unseen_XYZ.sum()
     assert voxel_scores.house_of("scene0000_00") is None
@@ -127,6 +148,30 @@ def test_recorded_windows_agree_with_what_frames_show(episode):
     assert house is not None
     for way in voxel_scores.open_doorways(CONFIG, episode, 11, 8):
         assert way.shape[-1] == 3
+
+
+@pytest.mark.slow
+def test_open_doorways_of_generated_houses_are_found():
+    """Houses have sills, and doors that open as the agent approaches."""
+    config = presets.load("persist")
+    voxels = VoxelsConfig(
+        record=True, cell=0.25, side=40, kinds="groups", colours=8, pictures="cells"
+    )
+    made = CollectConfig("data", train=3, frames=40, size=32, moving=True, voxels=voxels)
+    found = [read_episode(make_episode(made, "train", number)) for number in range(3)]
+    starts = [voxel_scores.most_doorways(config, one, range(7, 40), 8) for one in found]
+    counts = [
+        len(voxel_scores.open_doorways(config, one, at, 8))
+        for one, at in zip(found, starts, strict=True)
+    ]
+    assert sum(counts) >= 2
+
+
+def test_a_walk_begins_where_most_doorways_are_seen_open(monkeypatch):
+    seen = {7: 1, 8: 0, 9: 2, 10: 2}
+    monkeypatch.setattr(voxel_scores, "open_doorways", lambda c, e, at, n: [at] * seen[at])
+    assert voxel_scores.most_doorways(CONFIG, None, range(7, 11), 8) == 9
+    assert voxel_scores.most_doorways(CONFIG, None, range(8, 9), 8) == 8
 
 
 def pose(x, y, yaw):
@@ -144,6 +189,14 @@ def frames(count, value=0.0):
     )
     shape = (count, 16, 16)
     return Frames(np.full((*shape, 3), value, np.float32), np.ones(shape, np.float32), camera)
+
+
+def test_a_cell_of_which_one_pixel_is_seen_is_not_unseen():
+    seen = frames(1)
+    depth = np.zeros((1, 16, 16), np.float32)
+    depth[0, 8, 8] = 1.0  # 1 m ahead of (3, 3, 1.25)
+    shown = np.asarray(voxel_scores._shown(MASKED, jnp.array([2.0, 1.0, 0.0]), depth, seen.camera))
+    assert shown[4, 3:5, 2].any()
 
 
 def test_points_count_as_shown_in_front_of_the_depth():
@@ -191,10 +244,20 @@ def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
     assert rows["observation_logit"].observation_logit == 0
     hold = config.model.persistence_logit
     assert rows["guesses"].kept_logits == (hold, hold, hold)
+    assert [rows[name].sampled for name in ("persistence_logit", "sampled")] == ["always"] * 2
+    assert [rows[name].sampled for name in ("empty_prior", "guesses")] == ["new"] * 2
+    assert voxel_scores.mechanisms(config) == list(rows)
+    # A mechanism that the world does not have gets no row.
+    published = dataclasses.replace(CONFIG, model=MODEL)
+    assert voxel_scores.mechanisms(published) == [
+        "as trained",
+        "persistence_logit",
+        "observation_logit",
+    ]
 
 
 FACTS = {
-    "unseen": {"iou": 0.3, "prior": 0.12, "places": 24.0, "houses": 16.0},
+    "unseen": {"iou": 0.3, "prior": 0.12, "widened": 0.19, "places": 24.0, "houses": 16.0},
     "known": {"psnr": 22.5, "frames": 32},
     "long": {"data": "d", "walks": 2, "frames": 600, "ends": [200, 400, 600], "beside": ["small"]},
     "rows": {
@@ -216,6 +279,7 @@ def test_the_terminal_shows_each_score_and_a_row_for_each_mechanism():
     for wanted in (
         "0.300",
         "0.120 (2.50 times)",
+        "widened, 0.190",
         "22.50 dB",
         "+0.25 dB",
         "of 6 doorways seen open 5",
@@ -259,6 +323,58 @@ def test_an_edit_is_made_in_another_room_and_seen_later(episode):
             assert 0 <= plan.start < plan.end < episode.length
 
 
+class Corridor:
+    """An episode in three rooms in a row, whose walls hide all that is not in the agent's room."""
+
+    scene, width, height = "house-0", 16, 16
+    intrinsics_4 = np.array([8, 8, 8, 8], np.float32)
+    house = {  # noqa: RUF012 - it is not changed
+        "seed": 0,
+        "rooms": [(0, 0, 3, 3), (3.1, 0, 6.1, 3), (6.2, 0, 9.2, 3)],
+        "doorways": [(1, 2, 6.1, 1.0, 6.2, 2.0)],
+    }
+
+    def __init__(self, x, yaw):
+        self.name = f"from {x[0]}"
+        self.world_from_camera = np.stack([pose(a, 1.5, b) for a, b in zip(x, yaw, strict=True)])
+        self.length = len(x)
+        self.actions = np.zeros((self.length - 1, 3), np.float32)
+
+    def frames(self, indices):
+        (at,) = indices
+        x = self.world_from_camera[at][0, 3]
+        wall = 3.0 if x < 3 else 6.15 if x < 6.15 else 9.2
+        facing = self.world_from_camera[at][0, 2] > 0
+        depth = np.full((1, 16, 16), wall - x if facing else 0.5, np.float32)
+        return SimpleNamespace(depth_THW=depth)
+
+
+def test_a_door_is_opened_from_a_third_room_if_any_walk_leads_from_one(monkeypatch):
+    monkeypatch.setattr(voxel_edits, "house_of", lambda scene: Corridor.house)
+    monkeypatch.setattr(voxel_edits, "_is_closed", lambda *arguments: True)
+    third = Corridor(np.arange(0.5, 5.0, 0.5), np.zeros(9))
+    found = voxel_edits.plan(MASKED, third, "door")
+    assert found is not None
+    at = third.world_from_camera[found.start][0, 3]
+    assert at < 3  # in the room that the door does not belong to
+    assert 6.15 - at <= voxel_edits.REACH_M
+    # In the door's own rooms, the agent turns away from the door and back to it.
+    beside = Corridor(np.full(6, 4.0), np.array([np.pi, np.pi, np.pi, 0, 0, 0]))
+    behind = Corridor(np.linspace(7, 4, 6), np.array([0, 0, 0, 0, 0, 0]))
+    for own in (beside, behind):
+        assert voxel_edits.plan(MASKED, own, "door") is None
+    assert voxel_edits.plan(MASKED, beside, "door", beside=True) is None
+    found = voxel_edits.plan(MASKED, behind, "door", beside=True)
+    assert found is not None
+    assert behind.world_from_camera[found.start][0, 3] > 6.2
+    first = functools.partial(voxel_edits.first_plan, MASKED)
+    assert first([behind, third], "door")[0] is third
+    assert first([beside, behind], "door")[0] is behind
+    assert first([beside], "door") == (None, None)
+    # The wall of the next room is not seen from behind, which is a wall of the agent's own room.
+    assert voxel_edits.plan(MASKED, beside, "wall") is None
+
+
 def test_an_edit_changes_the_box_alone():
     memory = MASKED.memory
     grid = memory.empty(MASKED, jnp.zeros(3))
@@ -274,3 +390,52 @@ def test_an_edit_changes_the_box_alone():
     assert (np.asarray(moved.map.classes_XYZ)[4:6, 2:4, 2:4] == 3).all()
     assert not (np.asarray(gone.map.classes_XYZ) == 3).any()
     assert (np.asarray(class_grid.observed(gone.map)) == 1).sum() == 8
+
+
+def test_a_row_that_is_added_leaves_the_others_as_they_are(tmp_path, monkeypatch):
+    """Long walks take hours: pieces are measured again only if their own inputs differ."""
+    (tmp_path / "revisit").mkdir()
+    manifest = tmp_path / "revisit" / voxel_report.MANIFEST
+    manifest.write_text("{}")
+    measured = []
+
+    def measure(config, params, episodes, long, key):
+        measured.append(key)
+        if key[0] == "unseen":
+            return dict.fromkeys(("iou", "prior", "widened", "places", "houses"), np.ones(()))
+        video = np.zeros((1, 6, 2, 2, 3), np.uint8)
+        return {
+            "video": video, "seen": np.ones(2), "doorways": np.zeros(2), "psnr": np.ones(()),
+            "count": np.ones(2),
+        }  # fmt: skip
+
+    walks = SimpleNamespace(walks=[0], truth=np.zeros((1, 6, 2, 2, 3), np.uint8))
+    monkeypatch.setattr(voxel_report, "_measure", measure)
+    monkeypatch.setattr(voxel_report, "_read_walks", lambda config: walks)
+    monkeypatch.setattr(
+        voxel_report, "open_run", lambda name: SimpleNamespace(weights_hash=name + "'s weights")
+    )
+    cache = ResultCache(tmp_path / "cache")
+
+    def score(**changes):
+        measured.clear()
+        chosen = dataclasses.replace(CONFIG.evaluate, long=str(tmp_path), long_frames=6, **changes)
+        config = dataclasses.replace(CONFIG, evaluate=chosen)
+        facts = voxel_report.score(config, {}, [], cache, print)
+        assert facts is not None
+        return sorted(measured), list(facts["rows"])
+
+    own = "as trained"
+    first, rows = score()
+    assert first == [("known", own), ("long", own), ("unseen", own)]
+    more, rows = score(mechanisms="on", beside=("small",))
+    assert ("beside", "small") in more
+    assert not {*first} & {*more}
+    assert rows == [*voxel_scores.mechanisms(CONFIG), "small"]
+    assert score(beside=("small", "other"))[0] == [("beside", "other")]
+    manifest.write_text("{ }")
+    assert score()[0] == [("long", own)]
+    monkeypatch.setattr(
+        voxel_report, "open_run", lambda name: SimpleNamespace(weights_hash="trained again")
+    )
+    assert score(beside=("small",))[0] == [("beside", "small")]

@@ -360,7 +360,8 @@ def _stage(
 ) -> Stage:
     """Return a stage that trains the parameters of a pattern; all others are frozen.
 
-    To prepare its clips it ``reads`` parameters besides those of the two autoencoders.
+    To prepare its clips it ``reads`` parameters besides those of the two autoencoders. The name of
+    ``prepare`` keeps clips on disk apart from those of other stages.
     """
     return Stage(
         name=name,
@@ -369,7 +370,7 @@ def _stage(
         init=functools.partial(init, networks=networks),
         loss=loss,
         prepare=prepare,
-        prepares_by=("backbone", "codec", "voxel_vae", *reads),
+        prepares_by=("backbone", "codec", "voxel_vae", *reads, f"prepare.{prepare.__name__}"),
     )
 
 

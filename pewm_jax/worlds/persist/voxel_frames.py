@@ -268,14 +268,15 @@ def observe_cells(
 
 
 def visible_cells(
-    model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera
+    model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera, votes: int = VOTES
 ) -> tuple[Array, Array]:
     """Return which cells of a window depth shows to be empty and which to hold a surface, bool.
 
-    Arguments as for ``observe_cells``; depth may also be that of a rendered grid.
+    Arguments as for ``observe_cells``; depth may also be that of a rendered grid. ``votes`` is the
+    number of pixels that must show a surface.
     """
     cell, _ = _cells_met(model, corner_3, depth_HW, camera)
-    return _air_and_surface(model, corner_3, depth_HW, camera, cell)
+    return _air_and_surface(model, corner_3, depth_HW, camera, cell, votes)
 
 
 def _cells_met(
@@ -294,11 +295,16 @@ def _cells_met(
 
 
 def _air_and_surface(
-    model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera, cell_P: Array
+    model: PersistModel,
+    corner_3: Array,
+    depth_HW: Array,
+    camera: Camera,
+    cell_P: Array,
+    votes: int = VOTES,
 ) -> tuple[Array, Array]:
     side = model.side
     hits = jnp.zeros(side**3 + 1, jnp.int32).at[cell_P].add(1)[:-1]
-    surface = (hits >= VOTES).reshape((side,) * 3)
+    surface = (hits >= votes).reshape((side,) * 3)
     return _cells_in_front(model, corner_3, depth_HW, camera) & ~surface, surface
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import worlds
+from pewm_jax import presets, worlds
 from pewm_jax.config import Config, ConfigError, UserError
 from pewm_jax.memory import class_grid
 from pewm_jax.models.persist import voxel_dit
@@ -79,6 +79,16 @@ def test_guesses_may_change_and_what_was_observed_stays(params):
     some = np.asarray(decode(weak, params, latents, before, None, mask))
     np.testing.assert_array_equal(some[:2], 3)
     np.testing.assert_array_equal(some[2:], made[2:])
+    # A real image that shows something else changes an observed cell, by the preset's logits too.
+    preset = presets.load("persist").model
+    logits = {name: getattr(preset, name) for name in ("persistence_logit", "observation_logit")}
+    air = voxel_frames.ObservedCells(
+        jnp.zeros((8, 8, 8), bool).at[0].set(True), jnp.full((8, 8, 8), -1)
+    )
+    real = dataclasses.replace(MASKED, **logits)
+    changed = np.asarray(decode(real, params, latents, before, air, mask))
+    assert not changed[0, :, :6].any()
+    np.testing.assert_array_equal(changed[1], 3)
     # Levels that are not predicted keep their cells, and are empty if unknown.
     top = np.asarray(decode(MASKED, params, latents, before.at[..., 7].set(-1), None, mask))
     assert (top[..., 6] == 3).all()

@@ -1,6 +1,7 @@
 """The world of PERSIST: voxels that evolve, edits that stay, frames that know nothing of later."""
 
 import dataclasses
+import itertools
 import re
 
 import jax
@@ -374,6 +375,12 @@ def test_a_stage_learns_what_it_names_from_what_was_prepared(params, stage):
     labels = stage.labels(own)
     moves = jax.tree.map(lambda g, label: bool(np.any(g)) and label == "train", found, labels)
     assert any(jax.tree.leaves(moves))
+
+
+def test_clips_prepared_for_one_stage_are_not_read_by_another():
+    """Their folder is named by ``prepares_by`` and the batch, which two stages may share."""
+    for one, other in itertools.combinations(worlds.stages(MODEL), 2):
+        assert (one.prepares_by == other.prepares_by) == (one.prepare is other.prepare), one.name
 
 
 def test_windows_of_recorded_grids_are_those_of_a_rollout():
