@@ -68,6 +68,14 @@ def _clip_by_clip(encoded: Callable[..., Array], weights: Params, *videos: Array
     return placement.by_batch(one_by_one if traced else encoded, weights, *videos)
 
 
+def _one_after_the_other(decoded: Callable[[Array], Array], *parts: Array) -> Array:
+    """Decode colour and depth, each if traced, so that the memory is that of one of them."""
+    if isinstance(parts[0], Tracer):
+        return jax.lax.map(decoded, jnp.stack(parts))
+    video = decoded(jnp.concatenate(parts))
+    return video.reshape(len(parts), -1, *video.shape[1:])
+
+
 def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
     """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W).
 
@@ -82,9 +90,10 @@ def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> 
     if not model.codec.DEPTH_AS_GREY:
         rgb, signal = (model.codec.decode(weights, part) for part in parts)
     else:
-        both = jnp.concatenate(parts).astype(jnp.dtype(model.dtype))
-        video = model.codec.decode(weights, both).astype(jnp.float32)
-        rgb, signal = jnp.split(video, 2)
+        rgb, signal = _one_after_the_other(
+            lambda part: model.codec.decode(weights, part).astype(jnp.float32),
+            *(part.astype(jnp.dtype(model.dtype)) for part in parts),
+        )
     return jnp.clip(rgb, -1, 1), depth_from_signal(model.clip, signal.mean(-1))
 
 

@@ -4,10 +4,11 @@ Output frame t of a causal 3×3×3 convolution is a sum of three 2D convolutions
 t+2 of the padded video. There are four equivalent forms:
 
 * ``volume``: one 3D convolution, for which GPUs have a kernel.
-* ``stacked``: one 2D convolution of three neighbouring frames, side by side as channels. For few
-  videos XLA's compiler for TPUs splits the pixels of a 3D convolution into more videos and copies
-  them before and after. Of 2D convolutions all frames are its batch, which is large enough: half
-  of the memory traffic of an encoder, and half of its time of compilation.
+* ``stacked``: one 2D convolution of three neighbouring frames, side by side as channels. XLA's
+  compiler for TPUs splits the pixels of few videos into more and copies them before and after a 3D
+  convolution. Of 2D convolutions all frames are the batch: for two videos half of the memory
+  traffic of an encoder, and half of its time of compilation. For one video memory is the larger,
+  because its frames are padded to the 16 rows of a tile.
 * ``taps``: the sum of three 2D convolutions.
 * ``winograd``: four neighbouring output frames take twelve 2D convolutions. By Winograd's minimal
   filtering (1980) six suffice, applied to weighted sums of the six input frames. XLA's CPU backend
@@ -53,7 +54,7 @@ def convolve(how: Form, params: Params, padded_BTHWC: Array) -> Array:
     """
     dtype = padded_BTHWC.dtype
     _, frames, height, width, _ = padded_BTHWC.shape
-    kernel, how = params["kernel"], form(how, dtype)
+    kernel, how = params["kernel"], form(how, dtype, len(padded_BTHWC))
     if how == "volume":
         out = jax.lax.conv_general_dilated(
             padded_BTHWC,
@@ -157,12 +158,13 @@ def convolve_upsampled(params: Params, x_BTHWC: Array) -> Array:
     return (out + params["bias"]).astype(dtype)
 
 
-def form(how: Form, dtype: jnp.dtype) -> Form:
+def form(how: Form, dtype: jnp.dtype, videos: int) -> Form:
     """Return the form of the 3D convolutions; ``auto`` depends on the target of the trace."""
     if how != "auto":
         return how
     on_cpu: Form = "winograd" if dtype == jnp.float32 else "taps"
-    forms: dict[str, Form] = {"cpu": on_cpu, "tpu": "stacked"}
+    on_tpu: Form = "stacked" if videos > 1 else "volume"
+    forms: dict[str, Form] = {"cpu": on_cpu, "tpu": on_tpu}
     return forms.get(target.current().platform, "volume")
 
 

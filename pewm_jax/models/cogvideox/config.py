@@ -236,8 +236,8 @@ class VAEConfig:
     convolution: Literal["auto", "stacked", "taps", "volume", "winograd"] = "auto"
     """`volume`: 3D convolutions; `stacked`: 2D convolutions of three frames at once; `taps`: sums
     of 2D convolutions, faster on XLA's CPU backend; `winograd`: half as many 2D convolutions;
-    `auto`: on a CPU `winograd` in float32 and `taps` in 16 bits, on TPUs `stacked`, elsewhere
-    `volume`."""
+    `auto`: on a CPU `winograd` in float32 and `taps` in 16 bits, on TPUs for several videos
+    `stacked`, elsewhere `volume`."""
 
     @property
     def spatial(self) -> int:

@@ -53,25 +53,26 @@ def norm(
     factor, offset = (
         v[:, None, None, None] for v in group_norm_affine(params, x_BTHWC, groups, eps)
     )
+    wide = x_BTHWC.astype(jnp.float32)
     if latents_BthwC is not None:
         latents = latents_BthwC.astype(jnp.float32)
         by = pointwise(params["scale_by"], latents)
         factor, offset = by * factor, by * offset + pointwise(params["shift_by"], latents)
-        factor, offset = (stretch(v, x_BTHWC.shape) for v in (factor, offset))
-    return jax.nn.silu(x_BTHWC.astype(jnp.float32) * factor + offset).astype(x_BTHWC.dtype)
+        # The pixels of a cell are axes of their own, so that no array is upsampled.
+        batch, frames, height, width, channels = x_BTHWC.shape
+        h, w = latents.shape[2:4]
+        wide = wide.reshape(batch, frames, h, height // h, w, width // w, channels)
+        factor, offset = (stretch(v, frames)[:, :, :, None, :, None] for v in (factor, offset))
+    return jax.nn.silu(wide * factor + offset).astype(x_BTHWC.dtype).reshape(x_BTHWC.shape)
 
 
-def stretch(x_BthwC: Array, shape: tuple[int, ...]) -> Array:
-    """Upsample (nearest) to (B, T, H, W, C); if T is odd, the first frame is not repeated."""
-    _, frames, height, width, _ = shape
-    t, h, w = x_BthwC.shape[1:4]
+def stretch(x_BthwC: Array, frames: int) -> Array:
+    """Repeat frames of latents to a number of frames; if it is odd, the first is not repeated."""
     if frames > 1 and frames % 2:
         first, rest = x_BthwC[:, :1], x_BthwC[:, 1:]
-        rest = jnp.repeat(rest, (frames - 1) // (t - 1), axis=1)
-        x_BthwC = jnp.concatenate([first, rest], 1)
-    else:
-        x_BthwC = jnp.repeat(x_BthwC, frames // t, axis=1)
-    return jnp.repeat(jnp.repeat(x_BthwC, height // h, axis=2), width // w, axis=3)
+        rest = jnp.repeat(rest, (frames - 1) // rest.shape[1], axis=1)
+        return jnp.concatenate([first, rest], 1)
+    return jnp.repeat(x_BthwC, frames // x_BthwC.shape[1], axis=1)
 
 
 def resnet(
