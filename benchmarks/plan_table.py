@@ -84,9 +84,10 @@ class Piece:
 
     @property
     def key(self) -> str:
-        """Return the name of the result, with all that it depends on."""
+        """Return the name of the result, with all that it depends on but the library's code."""
         compiler = topology.compiler(self.chip)
         settings = serialize.to_dict(self.config)
+        del settings["evaluate"]  # no program depends on it
         many = f"{self.devices}x{self.slices}" if self.slices > 1 else str(self.devices)
         code = inputs_hash([settings, self.name, self.chip.name, many, compiler])[:16]
         return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{many}-{code}"
