@@ -115,13 +115,17 @@ def test_the_page_s_tables_are_the_recorded_ones(tables):
         )
 
 
-def test_make_runs_the_command_with_the_compilers_installed():
+@pytest.mark.parametrize(
+    ("goal", "command"),
+    [("plan-table", "benchmarks/plan_table.py --recorded"), ("test-all", "pytest")],
+)
+def test_make_runs_the_command_with_the_compilers_installed(goal, command):
     done = subprocess.run(
-        ["make", "--dry-run", "plan-table", "ARGS=--recorded"],
+        ["make", "--dry-run", "--always-make", goal, "ARGS=--recorded"],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,
     )
-    assert "benchmarks/plan_table.py --recorded" in done.stdout
+    assert command in done.stdout
     assert "plan-tpu,plan-cuda" in done.stdout
