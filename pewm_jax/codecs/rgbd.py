@@ -68,14 +68,6 @@ def _clip_by_clip(encoded: Callable[..., Array], weights: Params, *videos: Array
     return placement.by_batch(one_by_one if traced else encoded, weights, *videos)
 
 
-def _one_after_the_other(decoded: Callable[[Array], Array], *parts: Array) -> Array:
-    """Decode colour and depth, each if traced, so that the memory is that of one of them."""
-    if isinstance(parts[0], Tracer):
-        return jax.lax.map(decoded, jnp.stack(parts))
-    video = decoded(jnp.concatenate(parts))
-    return video.reshape(len(parts), -1, *video.shape[1:])
-
-
 def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> tuple[Array, Array]:
     """Invert ``encode_rgbd``: colour in [−1, 1] (B, T, H, W, 3) and metric depth (B, T, H, W).
 
@@ -90,11 +82,24 @@ def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> 
     if not model.codec.DEPTH_AS_GREY:
         rgb, signal = (model.codec.decode(weights, part) for part in parts)
     else:
-        rgb, signal = _one_after_the_other(
-            lambda part: model.codec.decode(weights, part).astype(jnp.float32),
-            *(part.astype(jnp.dtype(model.dtype)) for part in parts),
-        )
+        both = jnp.stack(parts).astype(jnp.dtype(model.dtype))
+        rgb, signal = _decode_both(model, weights, both)
     return jnp.clip(rgb, -1, 1), depth_from_signal(model.clip, signal.mean(-1))
+
+
+def _decode_both(model: AssembledModel, weights: Params, both_2BthwC: Array) -> Array:
+    """Decode colour and depth; one after the other if traced and clips are decoded as a whole.
+
+    The memory is then that of one of them.
+    """
+
+    def decoded(latents_BthwC: Array) -> Array:
+        return model.codec.decode(weights, latents_BthwC).astype(jnp.float32)
+
+    if isinstance(both_2BthwC, Tracer) and not model.codec.framewise:
+        return jax.lax.map(decoded, both_2BthwC)
+    video = decoded(both_2BthwC.reshape(-1, *both_2BthwC.shape[2:]))
+    return video.reshape(2, -1, *video.shape[1:])
 
 
 def mix(
