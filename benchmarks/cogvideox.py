@@ -170,7 +170,7 @@ def main() -> None:
     parser.add_argument("--smoke", action="store_true", help="tiny and quick: shows that it runs")
     parser.add_argument("--record", action="store_true", help="write the section of RESULTS.md")
     options = parser.parse_args()
-    torch.set_num_threads(min(2, os.cpu_count() or 1))
+    torch.set_num_threads(len(os.sched_getaffinity(0)))
     count = 1 if options.smoke else max(5, options.turns)
     rows, compiled = [], ""
     if options.only != "vae":

@@ -79,17 +79,18 @@ def normals(depth_THW: Array, camera: Camera) -> Array:
     depth edges do not bend the normal. They are in the world, and 0 where the depth of the
     neighbours is unknown.
     """
-    depth = jnp.asarray(depth_THW)
+    depth, camera = jax.tree.map(jnp.asarray, (depth_THW, camera))
     points = unproject(depth, camera)
     across, is_across = _step(points, depth, 2)
     down, is_down = _step(points, depth, 1)
-    normal = jnp.cross(across, down)
-    length = jnp.linalg.norm(normal, axis=-1, keepdims=True)
-    rays = points - jnp.asarray(camera.world_from_camera)[:, None, None, :3, 3]
-    away = (rays * normal).sum(-1, keepdims=True) > 0
-    normal = jnp.where(away, -normal, normal) / jnp.where(length > 0, length, 1)
+    rays = points - camera.world_from_camera[:, None, None, :3, 3]
+    (a, b, c), (d, e, f), (x, y, z) = (jnp.moveaxis(v, -1, 0) for v in (across, down, rays))
+    normal = b * f - c * e, c * d - a * f, a * e - b * d  # by coordinates: a CPU's fastest form
+    length = jnp.sqrt(sum(jnp.square(part) for part in normal))
+    away = x * normal[0] + y * normal[1] + z * normal[2] > 0
     known = (depth > 0) & jnp.isfinite(depth) & is_across & is_down
-    return jnp.where(known[..., None], normal, 0)
+    scale = jnp.where(away, -1.0, 1.0) * jnp.where(length > 0, length, 1)
+    return jnp.stack([jnp.where(known, part / scale, 0) for part in normal], -1)
 
 
 def _step(points_THW3: Array, depth_THW: Array, axis: int) -> tuple[Array, Array]:

@@ -139,7 +139,8 @@ def find(cell_V: Array, cell_P: Array) -> tuple[Array, Array]:
     """Look cells ``cell_P`` up in a sorted list ``cell_V``.
 
     Returns:
-        ``(slot_P, found_P)``; the slot is meaningless if the cell is not found.
+        ``(slot_P, found_P)``. If a cell is not found, its slot is where it would be inserted, or
+        the last one.
     """
     slot = jnp.searchsorted(cell_V, cell_P, method="scan").astype(jnp.int32)
     slot = jnp.minimum(slot, cell_V.shape[0] - 1)
@@ -157,12 +158,15 @@ def admit(cell_V: Array, cell_P: Array, no_cell: int) -> tuple[Array, Array]:
     capacity = cell_V.shape[0]
     ordered = jnp.sort(cell_P)
     before = jnp.concatenate([jnp.full((1,), -1, ordered.dtype), ordered[:-1]])
-    new = (ordered != before) & (ordered < no_cell) & ~find(cell_V, ordered)[1]
+    older, found = find(cell_V, ordered)
+    new = (ordered != before) & (ordered < no_cell) & ~found
     rank = jnp.cumsum(new, dtype=jnp.int32)
     fits = new & (rank <= capacity - (cell_V < no_cell).sum(dtype=jnp.int32))
-    fresh = jnp.full((capacity,), no_cell, cell_V.dtype)
-    fresh = fresh.at[jnp.where(fits, rank - 1, capacity)].set(ordered, mode="drop")
-    merged = jnp.sort(jnp.concatenate([cell_V, fresh]))[:capacity]
+    # A new cell comes after all older and all new ones with lower numbers; older cells move up.
+    place = jnp.where(fits, older + rank - 1, capacity)
+    fresh = jnp.full((capacity,), -1, cell_V.dtype).at[place].set(ordered, mode="drop")
+    moved = jnp.arange(capacity) - jnp.cumsum(fresh >= 0, dtype=jnp.int32)
+    merged = jnp.where(fresh >= 0, fresh, cell_V[jnp.maximum(moved, 0)])
     return merged, (new & ~fits).sum(dtype=jnp.int32)
 
 

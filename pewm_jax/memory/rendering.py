@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.geometry import depth_images, zbuffer
-from pewm_jax.geometry.cameras import project, unproject
+from pewm_jax.geometry.cameras import dot, project, unproject
 from pewm_jax.geometry.zbuffer import NEAREST_M, ProjectedPoints
 from pewm_jax.types import Array, Camera, Frames, View
 
@@ -114,7 +114,8 @@ def splat_surfels(
         projected = zbuffer.project_points(points_V3, size_V, size_V, valid_V, camera)
         away_V = None
         if sides:
-            away_V = ((points_V3 - camera.world_from_camera[:3, 3]) * sides[0]).sum(-1) > 0
+            ahead = points_V3 - camera.world_from_camera[:3, 3]
+            away_V = dot(ahead, sides[0]) > 0
 
         def drawn(
             projected: ProjectedPoints, features_VF: Array, away_V: Array | None

@@ -109,9 +109,8 @@ def insert(config: SurfelConfig, surfels: Surfels, new: Points, observed: bool =
         stays = stays | (known & was_observed if observed else known)
 
     corner = cells.corners(config, surfels.origin_3, jnp.where(taken, cell_P, 0))
-    offset = jnp.where(taken[:, None], new.points_P3 - corner, 0)
-    values = jnp.where(taken[:, None], new.values_PC, 0)
-    rows = jnp.concatenate([taken[:, None].astype(jnp.float32), offset, values], -1)
+    one = jnp.ones((len(cell_P), 1))  # rows of points that are not taken are dropped
+    rows = jnp.concatenate([one, new.points_P3 - corner, new.values_PC], -1)
     sums = jnp.where(stays[:, None], surfels.sums_VC[before], 0)
     size = jnp.where(stays, surfels.size_V[before], jnp.inf)
     size = size.at[target].min(new.size_P, mode="drop")

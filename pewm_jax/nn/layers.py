@@ -8,11 +8,13 @@ activations; norms are in float32. ``nn.modules`` has the same in the form of fl
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pewm_jax.nn import placement, target
 from pewm_jax.types import Array, Params
 
 EPSILON = 1e-5
@@ -21,8 +23,20 @@ EPSILON = 1e-5
 
 def linear(params: Params, x: Array) -> Array:
     """Multiply the last axis by ``kernel`` (in, out) and add ``bias``, if there is one."""
-    y = x @ params["kernel"].astype(x.dtype)
+    y = on_rows(lambda rows: rows @ params["kernel"].astype(x.dtype), x)
     return y + params["bias"].astype(x.dtype) if "bias" in params else y
+
+
+def on_rows(function: Callable[[Array], Array], x: Array) -> Array:
+    """Apply a function of the last axis to x; on one CPU to the rows (N, C) of one matrix.
+
+    XLA computes the gradient of a kernel as one product of two matrices then. With more axes its
+    CPU backend transposes one operand first, and the product takes up to twice as long.
+    """
+    if x.ndim < 3 or target.current().platform != "cpu" or placement.is_split():
+        return function(x)
+    rows = function(x.reshape(-1, x.shape[-1]))
+    return rows.reshape(*x.shape[:-1], rows.shape[-1])
 
 
 def mlp(params: Params, x: Array) -> Array:

@@ -9,16 +9,24 @@ import flax.linen as nn
 import jax.numpy as jnp
 
 from pewm_jax.nn import placement
-from pewm_jax.nn.layers import sinusoid
+from pewm_jax.nn.layers import on_rows, sinusoid
 from pewm_jax.types import Array
 
 zeros = nn.initializers.zeros_init()
 
 
-def dense(features: int, dtype: jnp.dtype, name: str, *, zero: bool = False) -> nn.Dense:
+class Dense(nn.Dense):
+    """A linear layer of flax, computed by ``layers.on_rows``."""
+
+    def __call__(self, inputs: Array) -> Array:
+        """(…, C) → (…, features)."""
+        return on_rows(super().__call__, inputs)
+
+
+def dense(features: int, dtype: jnp.dtype, name: str, *, zero: bool = False) -> Dense:
     """Return a linear layer with bias; ``zero`` initialises its kernel to zero."""
     kernel = zeros if zero else nn.initializers.lecun_normal()
-    return nn.Dense(features, dtype=dtype, kernel_init=kernel, name=name)
+    return Dense(features, dtype=dtype, kernel_init=kernel, name=name)
 
 
 def layer_norm(x: Array, name: str, epsilon: float = 1e-5) -> Array:

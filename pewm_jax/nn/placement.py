@@ -43,6 +43,11 @@ def _sizes() -> dict[str, int]:
     return dict(mesh.shape)
 
 
+def is_split() -> bool:
+    """Tell whether the current mesh splits arrays over several devices here."""
+    return bool(_sizes())
+
+
 def parts(name: str) -> int:
     """Return the number of parts that the current mesh splits an axis of this name into."""
     sizes = _sizes()

@@ -79,7 +79,7 @@ def _embeddings(model: AssembledModel) -> tuple[modules.nn.Dense, modules.nn.Den
     # variance preserves it.
     constant = modules.nn.initializers.normal(1.0)
     width = _settings(model).width
-    tokens = modules.nn.Dense(width, dtype=dtype, bias_init=constant, name="tokens")
+    tokens = modules.Dense(width, dtype=dtype, bias_init=constant, name="tokens")
     return camera, tokens
 
 

@@ -19,6 +19,7 @@ from optax.contrib import MuonDimensionNumbers, scale_by_muon
 
 from pewm_jax.config import Config, StageConfig
 from pewm_jax.io import tree
+from pewm_jax.nn import placement, target
 from pewm_jax.nn.deferred import STACKED
 from pewm_jax.types import Params
 from pewm_jax.worlds.stages import ADVERSARY, FREEZE, TRAIN, Stage
@@ -114,24 +115,76 @@ MUON_RMS = 0.2
 learning rate (Liu et al. 2025, "Muon is scalable for LLM training", Eq. 4)."""
 
 
+QUINTIC = (3.4445, -4.7750, 2.0315)
+"""Coefficients of a Newton–Schulz step (Jordan 2024), as in ``optax``."""
+STEPS = 5
+GROUPS = (3, 2)
+"""How the steps are grouped in ``orthogonalize`` for matrices at least twice as long as wide."""
+
+
 def muon(adam: optax.GradientTransformation) -> optax.GradientTransformation:
     """Return Muon for the matrices of hidden layers, and ``adam`` for all other leaves.
 
     Muon steps along the nearest orthogonal matrix to the momentum (Jordan 2024; ``optax.contrib``).
     A convolution is treated as a matrix from all its inputs to its outputs; stacked layers are
-    orthogonalized separately.
+    orthogonalized separately. On one CPU ``orthogonalize`` does so, with fewer products.
     """
 
     def names(trained: Params) -> Params:
         matrices = tree.assign(MATRICES, trained, "Muon's matrices")
         return jax.tree.map(lambda is_matrix: "muon" if is_matrix else "adam", matrices)
 
+    grouped = target.current().platform == "cpu" and not placement.is_split()
+
     def sized(updates: Any, params: Any = None) -> Any:
         del params
+        if grouped:  # so far divided by their norms only
+            updates = jax.tree_util.tree_map_with_path(_orthogonal, updates)
         return jax.tree_util.tree_map_with_path(_scale_update, updates)
 
-    hidden = optax.chain(scale_by_muon(weight_dimension_numbers=_axes), optax.stateless(sized))
+    momentum = scale_by_muon(
+        ns_coeffs=QUINTIC, ns_steps=0 if grouped else STEPS, weight_dimension_numbers=_axes
+    )
+    hidden = optax.chain(momentum, optax.stateless(sized))
     return optax.partition({"muon": hidden, "adam": adam}, names)
+
+
+def orthogonalize(x_LMN: Array, groups: tuple[int, ...]) -> Array:
+    """Orthogonalize matrices, M ≤ N, of norm 1 by Newton–Schulz steps in groups.
+
+    A step is X ← P(A) X with A = X Xᵀ and P(A) = a + b·A + c·A². The polynomials of a group of
+    steps commute, and A ← P(A) A P(A) is known without X. So X is multiplied once in a group,
+    instead of in every step, and the other products are of M × M matrices. Groups of more than
+    three steps would lose accuracy in small singular values.
+    """
+    first, second, third = QUINTIC
+    for steps in groups:
+        gram_LMM = x_LMN @ x_LMN.mT
+        factor_LMM = None
+        for step in range(steps):
+            rest_LMM = second * gram_LMM + third * (gram_LMM @ gram_LMM)
+            if steps == 1:
+                x_LMN = first * x_LMN + rest_LMM @ x_LMN
+                break
+            whole_LMM = rest_LMM + first * jnp.eye(x_LMN.shape[-2], dtype=x_LMN.dtype)
+            factor_LMM = whole_LMM if factor_LMM is None else whole_LMM @ factor_LMM
+            if step + 1 < steps:
+                half_LMM = first * gram_LMM + rest_LMM @ gram_LMM
+                gram_LMM = first * half_LMM + half_LMM @ rest_LMM
+        if factor_LMM is not None:
+            x_LMN = factor_LMM @ x_LMN
+    return x_LMN
+
+
+def _orthogonal(path: Any, x: Array) -> Array:
+    """Orthogonalize one leaf, whose matrices have norm 1."""
+    inputs = math.prod(x.shape[_first_matrix_axis(path) : -1])
+    matrices = x.reshape(-1, inputs, x.shape[-1])
+    few, many = sorted(matrices.shape[1:])
+    groups = GROUPS if many >= 2 * few else (1,) * STEPS
+    wide = matrices if inputs == few else matrices.mT
+    found = orthogonalize(wide, groups)
+    return (found if inputs == few else found.mT).reshape(x.shape)
 
 
 def _axes(updates: Any) -> Any:

@@ -27,6 +27,7 @@ import numpy as np
 
 from pewm_jax.config import AssembledModel
 from pewm_jax.geometry.cameras import unproject
+from pewm_jax.nn import placement, target
 from pewm_jax.types import Array, Camera, EncodedView, MapTokens, MemoryReadout, View
 
 BROAD = 8
@@ -90,7 +91,7 @@ def plant_errors(
     chosen = jax.random.bernoulli(chosen_key, share, (batch,))
     limit = None if model.memory.KEEPS_FEATURES else 1.0
 
-    def of_clip(readout: MemoryReadout, camera: Camera, key: Array) -> MemoryReadout:
+    def changed(readout: MemoryReadout, camera: Camera, key: Array) -> MemoryReadout:
         keys = jax.random.split(key, 3)
         tokens, view, encoded = readout.tokens, readout.view, readout.encoded
         return MemoryReadout(
@@ -99,14 +100,17 @@ def plant_errors(
             None if encoded is None else perturb_latents(encoded, keys[2]),
         )
 
-    made = jax.vmap(of_clip)(
-        readout, jax.tree.map(jnp.asarray, camera), jax.random.split(key, batch)
-    )
-    return jax.tree.map(lambda new, old: jnp.where(_over(chosen, old), new, old), made, readout)
+    def of_clip(clip: tuple[Array, MemoryReadout, Camera, Array]) -> MemoryReadout:
+        chosen, *inputs = clip
+        return jax.lax.cond(chosen, changed, lambda readout, *_: readout, *inputs)
 
+    def of_batch(_: None, *clips: Any) -> MemoryReadout:
+        return jax.lax.map(of_clip, clips)
 
-def _over(chosen_B: Array, like: Array) -> Array:
-    return chosen_B.reshape(-1, *(1,) * (like.ndim - 1))
+    clips = chosen, readout, jax.tree.map(jnp.asarray, camera), jax.random.split(key, batch)
+    if target.current().platform == "cpu":  # one by one, errors are computed only where chosen
+        return placement.by_batch(of_batch, None, *clips)
+    return jax.vmap(lambda *clip: of_clip(clip))(*clips)
 
 
 def perturb_view(view: View, camera: Camera, key: Array, limit: float | None = None) -> View:
@@ -117,11 +121,8 @@ def perturb_view(view: View, camera: Camera, key: Array, limit: float | None = N
     which = jax.random.bernoulli(keys.pop("which"), EACH, (len(kinds),))
     points = unproject(jnp.asarray(view.depth_THW), camera)
     found = view
-    for number, (kind, own) in enumerate(zip(kinds, keys.values(), strict=True)):
-        changed = kind(found, points, camera, own)
-        found = jax.tree.map(
-            lambda new, old, n=number: jnp.where(which[n], new, old), changed, found
-        )
+    for drawn, kind, own in zip(which, kinds, keys.values(), strict=True):
+        found = jax.lax.cond(drawn, kind, lambda view, *_: view, found, points, camera, own)
     seen = found.seen_THW
     features = jnp.where(seen[..., None], found.features_THWF, 0)
     if limit is not None:

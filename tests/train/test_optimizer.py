@@ -5,9 +5,11 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from pewm_jax.config import ConfigError, StageConfig
+from pewm_jax.nn import target
 from pewm_jax.train import optimizer, runs
 from pewm_jax.worlds.pewm import world as pewm
 from tests.train import fakes
@@ -89,3 +91,28 @@ def test_nothing_to_train_is_refused_and_empty_stages_are_skipped():
         runs.planned(fakes.config(stage1=0, stage2=0))
     assert [s.number for s in runs.planned(fakes.config(stage2=0))] == [1]
     assert [s.number for s in runs.planned(fakes.config())] == [1, 2]
+
+
+def test_fewer_products_on_a_cpu_give_the_updates_of_optax():
+    rng = np.random.default_rng(0)
+    shapes = {
+        "blocks": {name: {"kernel": (2, *shape)} for name, shape in
+                   (("wide", (16, 64)), ("long", (64, 16)), ("square", (24, 24)))},
+        "convolution": {"kernel": (3, 3, 8, 16)},
+    }  # fmt: skip
+    gradients = jax.tree.map(
+        lambda shape: jnp.asarray(rng.normal(size=shape), jnp.float32),
+        shapes,
+        is_leaf=lambda x: isinstance(x, tuple),
+    )
+    found = []
+    for platform in ("cuda", "cpu"):
+        with target.use(target.Target(platform)):
+            muon = optimizer.muon(optax.scale_by_adam())
+            state = muon.init(gradients)
+            found.append(jax.jit(muon.update)(gradients, state, gradients))
+    (expected, expected_state), (updates, state) = found
+    assert jax.tree.structure(state) == jax.tree.structure(expected_state)
+    for left, right in zip(*map(jax.tree.leaves, (updates, expected)), strict=True):
+        largest = float(np.abs(right).max())
+        np.testing.assert_allclose(left, right, atol=1e-4 * largest)

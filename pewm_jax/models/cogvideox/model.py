@@ -3,8 +3,9 @@
 Text and video tokens attend jointly. Each kind has its own adaptive-layernorm modulation from the
 time embedding ("expert" adaptive layernorm) around one shared layernorm. Queries and keys are
 normalised per head, and video tokens get a 3D rotary embedding. The blocks are scanned, so
-compile time does not grow with depth. Reference: ``CogVideoXTransformer3DModel`` of diffusers;
-``models.cogvideox.config`` has the settings of its five published networks.
+compile time does not grow with depth (small networks on a CPU are unrolled: ``UNROLLED``).
+Reference: ``CogVideoXTransformer3DModel`` of diffusers; ``models.cogvideox.config`` has the
+settings of its five published networks.
 
 A memory enters the network in two places: ``memory_block`` runs after every block, and
 ``added_BND`` is added to the embedded tokens (both from ``models.interface.Readers``).
@@ -26,7 +27,7 @@ from pewm_jax.errors import UserError
 from pewm_jax.models.cogvideox import positions
 from pewm_jax.models.cogvideox.config import DiTConfig
 from pewm_jax.nn import attention as blocked_attention
-from pewm_jax.nn import layers, modules, placement
+from pewm_jax.nn import layers, modules, placement, target
 from pewm_jax.nn.tokens import TokenLayout, patchify, unpatchify
 from pewm_jax.types import Array, Params
 
@@ -38,6 +39,12 @@ OFS = 2.0
 KEEP = jax.checkpoint_policies.dots_saveable
 """What a block stores for its backward pass: the results of matrix products. Norms, modulation,
 rotation and gelu are cheaper to recompute than to store for every layer and read back."""
+
+UNROLLED = 2048
+"""Largest layers × width of a network that is unrolled on a CPU: compilation takes longer with the
+layers, and large matrices make the copies unimportant."""
+WORTHWHILE = 2**17
+"""Fewest values of the tokens with which it is."""
 
 
 def open_gates(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
@@ -63,7 +70,7 @@ class LayerNormZero(nn.Module):
         ``time_BE`` is (B, E); or (B, 1 + t, E): the text's, then one for each token in time.
         """
         width, dtype = tokens_BND.shape[-1], tokens_BND.dtype
-        linear = nn.Dense(
+        linear = modules.Dense(
             6 * width,
             dtype=dtype,
             kernel_init=modules.zeros,
@@ -79,7 +86,10 @@ class LayerNormZero(nn.Module):
             joined = layout.join(text, layout.per_token(video[:, 1:]))
             video = text = joined
         is_text = jnp.asarray(layout.is_text)
-        shift, scale, gate = jnp.split(jnp.where(is_text, text, video), 3, -1)
+        shift, scale, gate = (  # apart, so that no gradient of all three is joined
+            jnp.where(is_text, *parts)
+            for parts in zip(jnp.split(text, 3, -1), jnp.split(video, 3, -1), strict=True)
+        )
         normed = modules.layer_norm(tokens_BND, "norm")
         return placement.constrain(normed * (1 + scale) + shift, "batch", "tokens"), gate
 
@@ -283,10 +293,21 @@ def apply(
         return placement.constrain(tokens, "batch", "tokens"), None
 
     body = jax.checkpoint(body) if config.remat else body
-    tokens, _ = jax.lax.scan(body, tokens, (params["blocks"], memory_params))
+    unroll = _unrolls(config, tokens)
+    tokens, _ = jax.lax.scan(body, tokens, (params["blocks"], memory_params), unroll=unroll)
     video = layout.split(tokens)[1]
     patches: Array = ends.apply(ends_params, video, time, layout, method="project")
     return unpatchify(layout.gather(patches), frames, height, width, patch, patch_t)
+
+
+def _unrolls(config: DiTConfig, tokens_BND: Array) -> bool:
+    """Tell whether layers run without a loop: on one CPU, where many values would be copied.
+
+    A loop stacks what the backward pass needs, and copies it twice.
+    """
+    one_cpu = target.current().platform == "cpu" and not placement.is_split()
+    small = config.layers * config.width <= UNROLLED
+    return one_cpu and small and tokens_BND.size >= WORTHWHILE
 
 
 def _per_clip(timesteps: Array, batch: int) -> Array:

@@ -261,3 +261,21 @@ def test_published_networks_have_the_sizes_of_their_names():
 def test_settings_that_cannot_work_are_refused(changes, says):
     with pytest.raises(ConfigError, match=says):
         DiTBackbone(**changes)
+
+
+def test_layers_without_a_loop_give_the_values_and_gradients_of_the_loop(monkeypatch):
+    params, given = random_params(), inputs()
+
+    def loss(params):
+        return jnp.square(dit.apply(CONFIG, params, *given)).mean()
+
+    def found(least):
+        monkeypatch.setattr(dit, "WORTHWHILE", least)
+        lowered = jax.jit(jax.value_and_grad(loss)).lower(params)
+        return lowered.as_text().count("stablehlo.while"), lowered.compile()(params)
+
+    (loops, (value, gradients)), (fewer, (other, others)) = found(2**40), found(0)
+    assert fewer < loops
+    np.testing.assert_allclose(value, other, rtol=1e-5)
+    for left, right in zip(*map(jax.tree.leaves, (gradients, others)), strict=True):
+        np.testing.assert_allclose(left, right, atol=1e-5 * max(1, float(np.abs(left).max())))
