@@ -10,7 +10,8 @@ t+2 of the padded video. There are five equivalent forms:
   traffic of an encoder, and half of its time of compilation. For one video memory is the larger,
   because its frames are padded to the 16 rows of a tile.
 * ``frames``: the same, one frame after the other, each with what precedes the convolution. Only
-  inputs and outputs are held for all frames, so that a decoder needs a quarter of the memory.
+  inputs and outputs are held for all frames. The compiler for TPUs splits the pixels of each frame
+  again: the memory traffic is twice that of ``stacked``.
 * ``taps``: the sum of three 2D convolutions.
 * ``winograd``: four neighbouring output frames take twelve 2D convolutions. By Winograd's minimal
   filtering (1980) six suffice, applied to weighted sums of the six input frames. XLA's CPU backend
