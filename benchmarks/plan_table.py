@@ -2,13 +2,15 @@
 
     make plan-table                                  # both tables; hours on two cores
     make plan-table ARGS="--only training --chips h100 --presets pewm_2b"
-    make plan-table ARGS=--record                    # and rewrites the tables
+    make plan-table ARGS=--record                    # adds them to plan_table.json and the page
+    make plan-table ARGS=--recorded                  # prints plan_table.json; compiles nothing
 
 No device is needed, only the extras plan-tpu and plan-cuda. Every number is one that `pewm-jax plan
 PRESET --chip C --devices N --compiler target [--inference]` prints. Finished programs are kept in
 ``--folder`` by their settings, the chip and the compiler's version: after an interruption, run the
-same command again. After a change of the library's code, choose another folder. ``--kept`` compiles
-nothing and prints what is there.
+same command again, or use them alone (``--kept``). After a change of the library's code, choose
+another folder. ``plan_table.json`` has the last report of every program; the tables of the page are
+written from it.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import itertools
+import json
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -26,6 +29,7 @@ from record import machine, record, table
 from pewm_jax import presets
 from pewm_jax.cli import parser as cli
 from pewm_jax.config import Config, UserError, serialize
+from pewm_jax.io import atomic
 from pewm_jax.io.store import TABLE, ResultCache, inputs_hash, map_resumable
 from pewm_jax.plan import inference, target_compiler, topology
 from pewm_jax.plan.plan import arranged, flop, gib
@@ -35,6 +39,8 @@ from pewm_jax.train.chips import Chip
 from pewm_jax.train.log import duration
 
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
+RESULTS = Path(__file__).with_suffix(".json")
+"""The recorded reports: name of a program → its ``Piece``, its settings' hash, the report."""
 PRESETS = ("pewm_2b", "pewm_5b", "pewm_5b_i2v", "egowm_svd", "egowm_cosmos2b", "persist_xl")
 TRAINING, INFERENCE = "training", "inference"
 CHIPS = {TRAINING: ("h100", "v5p"), INFERENCE: ("h100", "a100", "v5e", "v6e")}
@@ -84,12 +90,34 @@ class Piece:
 
     @property
     def key(self) -> str:
-        """Return the name of the result, with all that it depends on."""
+        """Return the name of the result, with all that it depends on but the library's code."""
         compiler = topology.compiler(self.chip)
+        code = inputs_hash([self.settings, self.name, self.chip.name, self.many, compiler])[:16]
+        return f"{self.id}-{code}"
+
+    @property
+    def id(self) -> str:
+        """Return the name of the program."""
+        return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{self.many}"
+
+    @property
+    def many(self) -> str:
+        """Return the number of devices, and of slices if there are several."""
+        return f"{self.devices}x{self.slices}" if self.slices > 1 else str(self.devices)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Return the settings that programs depend on."""
         settings = serialize.to_dict(self.config)
-        many = f"{self.devices}x{self.slices}" if self.slices > 1 else str(self.devices)
-        code = inputs_hash([settings, self.name, self.chip.name, many, compiler])[:16]
-        return f"{self.table}/{self.preset}-{self.name}-{self.chip.name}-{many}-{code}"
+        del settings["evaluate"]
+        return settings
+
+    @property
+    def order(self) -> tuple[Any, ...]:
+        """Return a key that sorts programs: by table, number of devices, preset and chip."""
+        known, names = [*PRESETS, self.preset], [*CHIPS[self.table], self.chip.name]
+        wide = self.devices > DEVICES
+        return self.table, wide, known.index(self.preset), names.index(self.chip.name)
 
     def compile(self) -> StageReport:
         """Ask the chip's compiler."""
@@ -131,6 +159,68 @@ def compiled(missing: list[Piece]) -> Iterator[tuple[Piece, dict[str, Any]]]:
             found = {"error": str(error)}
             print(f"  {error}", flush=True)
         yield piece, found
+
+
+def recorded(results: Path) -> dict[Piece, dict[str, Any]]:
+    """Return the recorded programs, sorted, each with its report, machine and settings' hash."""
+    told = json.loads(results.read_text()) if results.exists() else {}
+    found = {
+        Piece(**{**entry["piece"], "chip": chips.named(entry["piece"]["chip"])}): entry
+        for entry in told.values()
+    }
+    return dict(sorted(found.items(), key=lambda item: item[0].order))
+
+
+def keep(found: dict[Piece, dict[str, Any]], results: Path) -> None:
+    """Add reports to the recorded ones, or replace them; failures are left out."""
+    entries = recorded(results) | {
+        piece: {
+            "piece": dataclasses.asdict(piece) | {"chip": piece.chip.name},
+            "settings": inputs_hash(piece.settings)[:16],
+            "machine": machine("jax"),
+            "report": told,
+        }
+        for piece, told in found.items()
+        if "error" not in told
+    }
+    entries = dict(sorted(entries.items(), key=lambda item: item[0].order))
+    told = {piece.id: entry for piece, entry in entries.items()}
+    atomic.write_text(results, json.dumps(told, indent=1) + "\n")
+
+
+def of_today(piece: Piece, entry: dict[str, Any]) -> bool:
+    """Tell whether a recorded program has the preset's present settings."""
+    return entry["settings"] == inputs_hash(piece.settings)[:16]
+
+
+def text_of(which: str, found: dict[Piece, dict[str, Any]], machines: Sequence[str]) -> str:
+    """Return a table, with the compilers below it."""
+    if not found:
+        return "None so far."
+    compilers = {
+        f"{told['compiler']['name']} {told['compiler']['version']}"
+        for told in found.values()
+        if "error" not in told
+    }
+    rows = [row(piece, told) for piece, told in found.items()]
+    width = len(HEADS[which])
+    rows = [[*cells, *[""] * (width - len(cells))] for cells in rows]
+    return (
+        f"{table(HEADS[which], rows)}\n\nCompiled by {'; '.join(sorted(compilers))}. "
+        f"{'; '.join(machines)}."
+    )
+
+
+def recorded_text(which: str, results: Path) -> str:
+    """Return the table of the recorded programs."""
+    entries = {one: entry for one, entry in recorded(results).items() if one.table == which}
+    found = {
+        one if of_today(one, entry) else dataclasses.replace(one, title=f"{one.title} †"): entry
+        for one, entry in entries.items()
+    }
+    machines = sorted({entry["machine"] for entry in found.values()})
+    text = text_of(which, {one: entry["report"] for one, entry in found.items()}, machines)
+    return f"{text} †: with earlier settings of the preset." if " † |" in text else text
 
 
 def row(piece: Piece, found: dict[str, Any]) -> list[str]:
@@ -190,17 +280,22 @@ def arguments(argv: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument("--slices", type=int, default=1, help="with --devices: slices of them")
     parser.add_argument("--folder", type=Path, default=Path("runs/plan-table"))
-    parser.add_argument("--kept", action="store_true", help="compile nothing")
-    parser.add_argument("--record", action="store_true", help="rewrite docs/scaling.md")
+    parser.add_argument("--kept", action="store_true", help="use what the folder has")
+    parser.add_argument("--record", action="store_true", help="rewrite results and page")
+    parser.add_argument("--recorded", action="store_true", help="print results, compile nothing")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="the recorded reports")
     parser.add_argument("--page", type=Path, default=PAGE, help="the page to rewrite")
     return parser.parse_args(argv)
 
 
 def main(argv: Sequence[str]) -> None:
-    """Compile what is missing, print the tables, and write them if asked to."""
+    """Compile what is missing, print the tables, and record them if asked to."""
     options = arguments(argv)
     cache = ResultCache(options.folder, TABLE)
     for which in (options.only,) if options.only else CHIPS:
+        if options.recorded:
+            print(f"\n{recorded_text(which, options.results)}\n")
+            continue
         asked = [
             one for one in pieces(which, options) if one.name in (options.names or (one.name,))
         ]
@@ -218,19 +313,10 @@ def main(argv: Sequence[str]) -> None:
                 log=print,
                 is_usable=lambda _, kept: "error" not in kept,
             )
-        compilers = {
-            f"{told['compiler']['name']} {told['compiler']['version']}"
-            for told in found.values()
-            if "error" not in told
-        }
-        rows = [row(piece, told) for piece, told in found.items()]
-        width = len(HEADS[which])
-        rows = [[*cells, *[""] * (width - len(cells))] for cells in rows]
-        source = f"Compiled by {'; '.join(sorted(compilers))}. {machine('jax')}."
-        text = f"{table(HEADS[which], rows)}\n\n{source}"
-        print(f"\n{text}\n")
+        print(f"\n{text_of(which, found, [machine('jax')])}\n")
         if options.record:
-            record(f"plan-{which}", text, options.page)
+            keep(found, options.results)
+            record(f"plan-{which}", recorded_text(which, options.results), options.page)
 
 
 if __name__ == "__main__":

@@ -82,10 +82,24 @@ def decode_rgbd(model: AssembledModel, params: Params, latents_BthwC: Array) -> 
     if not model.codec.DEPTH_AS_GREY:
         rgb, signal = (model.codec.decode(weights, part) for part in parts)
     else:
-        both = jnp.concatenate(parts).astype(jnp.dtype(model.dtype))
-        video = model.codec.decode(weights, both).astype(jnp.float32)
-        rgb, signal = jnp.split(video, 2)
+        both = jnp.stack(parts).astype(jnp.dtype(model.dtype))
+        rgb, signal = _decode_both(model, weights, both)
     return jnp.clip(rgb, -1, 1), depth_from_signal(model.clip, signal.mean(-1))
+
+
+def _decode_both(model: AssembledModel, weights: Params, both_2BthwC: Array) -> Array:
+    """Decode colour and depth; one after the other if traced and clips are decoded as a whole.
+
+    The memory is then that of one of them.
+    """
+
+    def decoded(latents_BthwC: Array) -> Array:
+        return model.codec.decode(weights, latents_BthwC).astype(jnp.float32)
+
+    if isinstance(both_2BthwC, Tracer) and not model.codec.framewise:
+        return jax.lax.map(decoded, both_2BthwC)
+    video = decoded(both_2BthwC.reshape(-1, *both_2BthwC.shape[2:]))
+    return video.reshape(2, -1, *video.shape[1:])
 
 
 def mix(

@@ -1,13 +1,17 @@
 """3D convolutions of videos, in the form that the backend runs fastest.
 
 Output frame t of a causal 3×3×3 convolution is a sum of three 2D convolutions, of frames t, t+1 and
-t+2 of the padded video. There are four equivalent forms:
+t+2 of the padded video. There are five equivalent forms:
 
 * ``volume``: one 3D convolution, for which GPUs have a kernel.
-* ``stacked``: one 2D convolution of three neighbouring frames, side by side as channels. For few
-  videos XLA's compiler for TPUs splits the pixels of a 3D convolution into more videos and copies
-  them before and after. Of 2D convolutions all frames are its batch, which is large enough: half
-  of the memory traffic of an encoder, and half of its time of compilation.
+* ``stacked``: one 2D convolution of three neighbouring frames, side by side as channels. XLA's
+  compiler for TPUs splits the pixels of few videos into more and copies them before and after a 3D
+  convolution. Of 2D convolutions all frames are the batch: for two videos half of the memory
+  traffic of an encoder, and half of its time of compilation. For one video memory is the larger,
+  because its frames are padded to the 16 rows of a tile.
+* ``frames``: the same, one frame after the other, each with what precedes the convolution. Only
+  inputs and outputs are held for all frames. The compiler for TPUs splits the pixels of each frame
+  again: the memory traffic is twice that of ``stacked``.
 * ``taps``: the sum of three 2D convolutions.
 * ``winograd``: four neighbouring output frames take twelve 2D convolutions. By Winograd's minimal
   filtering (1980) six suffice, applied to weighted sums of the six input frames. XLA's CPU backend
@@ -37,7 +41,7 @@ WORTHWHILE = 256
 """Fewest output pixels of all frames for which ``winograd`` is faster."""
 SAME, AFTER = ((1, 1), (1, 1)), ((0, 1), (0, 1))
 """Padding by one row or column of zeros on every side, and below and to the right alone."""
-Form = Literal["auto", "stacked", "taps", "volume", "winograd"]
+Form = Literal["auto", "frames", "stacked", "taps", "volume", "winograd"]
 
 
 def convolve(how: Form, params: Params, padded_BTHWC: Array) -> Array:
@@ -53,7 +57,7 @@ def convolve(how: Form, params: Params, padded_BTHWC: Array) -> Array:
     """
     dtype = padded_BTHWC.dtype
     _, frames, height, width, _ = padded_BTHWC.shape
-    kernel, how = params["kernel"], form(how, dtype)
+    kernel, how = params["kernel"], form(how, dtype, len(padded_BTHWC))
     if how == "volume":
         out = jax.lax.conv_general_dilated(
             padded_BTHWC,
@@ -62,7 +66,7 @@ def convolve(how: Form, params: Params, padded_BTHWC: Array) -> Array:
             ((0, 0), *SAME),
             dimension_numbers=("NDHWC", "DHWIO", "NDHWC"),
         )
-    elif how == "stacked":
+    elif how in ("frames", "stacked"):
         out = _stacked(padded_BTHWC, kernel.astype(dtype))
     elif how == "winograd" and (frames - 2) * height * width >= WORTHWHILE:
         out = _winograd(padded_BTHWC, kernel)
@@ -80,6 +84,35 @@ def convolve_causal(
     """
     padded = jnp.concatenate([past_BTHWC, x_BTHWC], 1)
     return convolve(how, params, padded), padded[:, -2:]
+
+
+def convolve_frame_by_frame(
+    params: Params,
+    before: Callable[..., Array],
+    parts: Sequence[Array],
+    past_BTHWC: Array | None,
+) -> tuple[Array, Array]:
+    """Return ``convolve_causal`` of ``before(*parts)``, one frame after the other.
+
+    ``before`` maps frames of the parts, (B, T, …) each, to frames (B, T, H, W, C). If there is no
+    past, the first of them is repeated.
+    """
+    if past_BTHWC is None:
+        past_BTHWC = jnp.repeat(before(*(part[:, :1] for part in parts)), 2, axis=1)
+
+    def body(past: Array, frame: tuple[Array, ...]) -> tuple[Array, Array]:
+        padded = jnp.concatenate([past, before(*(part[:, None] for part in frame))], 1)
+        return padded[:, 1:], convolve("stacked", params, padded)[:, 0]
+
+    frames = tuple(jnp.moveaxis(part, 1, 0) for part in parts)
+    past_BTHWC, out = jax.lax.scan(body, past_BTHWC, frames)
+    return jnp.moveaxis(out, 0, 1), past_BTHWC
+
+
+def frame_by_frame(function: Callable[[Array], Array], x_BTHWC: Array) -> Array:
+    """Return a function's value for each frame (B, 1, …), computed one after the other."""
+    out = jax.lax.map(lambda frame: function(frame[:, None])[:, 0], jnp.moveaxis(x_BTHWC, 1, 0))
+    return jnp.moveaxis(out, 0, 1)
 
 
 def in_chunks(
@@ -157,12 +190,16 @@ def convolve_upsampled(params: Params, x_BTHWC: Array) -> Array:
     return (out + params["bias"]).astype(dtype)
 
 
-def form(how: Form, dtype: jnp.dtype) -> Form:
-    """Return the form of the 3D convolutions; ``auto`` depends on the target of the trace."""
+def form(how: Form, dtype: jnp.dtype, videos: int, *, decodes: bool = False) -> Form:
+    """Return the form of the 3D convolutions; ``auto`` depends on the target of the trace.
+
+    ``decodes`` tells whether they are those of a decoder whose norms can be computed by frames.
+    """
     if how != "auto":
         return how
     on_cpu: Form = "winograd" if dtype == jnp.float32 else "taps"
-    forms: dict[str, Form] = {"cpu": on_cpu, "tpu": "stacked"}
+    on_tpu: Form = "frames" if decodes else "stacked" if videos > 1 else "volume"
+    forms: dict[str, Form] = {"cpu": on_cpu, "tpu": on_tpu}
     return forms.get(target.current().platform, "volume")
 
 

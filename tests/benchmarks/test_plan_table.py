@@ -1,12 +1,13 @@
 """The tables of all presets: kept programs, rows, and the page."""
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from pewm_jax.config import UserError
+from pewm_jax.config import DataConfig, UserError
 from pewm_jax.plan import inference
 from tests.plan.test_target_compiler import report
 
@@ -73,26 +74,58 @@ def test_the_paper_s_presets_are_compiled_for_many_devices_and_slices_too(
     assert "| tiny | 1 | 64 × v5p in 4 slices | fsdp 8 |" in capsys.readouterr().out
 
 
-def test_the_page_gets_the_tables(tables, tmp_path):
-    plan_table, _ = tables
-    page = tmp_path / "scaling.md"
+def test_the_page_gets_all_recorded_programs(tables, tmp_path, monkeypatch, capsys):
+    plan_table, asked = tables
+    page, results = tmp_path / "scaling.md", tmp_path / "results.json"
     page.write_text((ROOT / "docs" / "scaling.md").read_text())
-    flags = ["--presets", "tiny", "--chips", "h100", "--folder", str(tmp_path / "kept")]
-    plan_table.main([*flags, "--record", "--page", str(page)])
+    flags = ["--page", str(page), "--results", str(results), "--folder", str(tmp_path / "kept")]
+    for chip in ("v5p", "h100"):
+        plan_table.main(["--presets", "tiny", "--chips", chip, *flags, "--record"])
+    asked.clear()
+    plan_table.main(["--presets", "tiny", "--chips", "v5p", *flags, "--record", "--kept"])
     text = page.read_text()
+    capsys.readouterr()
+    plan_table.main(["--recorded", *flags])
+    assert asked == [], "compiled again"
+    printed = capsys.readouterr().out
     for which in plan_table.CHIPS:
         inside = text.split(f"<!-- plan-{which} -->")[1].split(f"<!-- /plan-{which} -->")[0]
-        assert inside.count("| tiny |") == (2 if which == "training" else 5)
+        chips = [line.split(" | ")[2] for line in inside.splitlines() if "| tiny |" in line]
+        wanted = (
+            ["8 × h100"] * 2 + ["8 × v5p"] if which == "training" else ["h100"] * 5 + ["v5p"] * 5
+        )
+        assert chips == wanted, "a failure is not recorded"
         assert "Compiled by libtpu 0.0.51." in inside
+        assert "†" not in inside
+        assert inside.strip() in printed
+    with_more = dataclasses.replace(plan_table.presets.load("tiny"), data=DataConfig(path="other"))
+    monkeypatch.setattr(plan_table.presets, "load", lambda name: with_more)
+    assert "| tiny | 1 † | 8 × h100 |" in plan_table.recorded_text("training", results)
 
 
-def test_make_runs_the_command_with_the_compilers_installed():
+def test_the_page_s_tables_are_the_recorded_ones(tables):
+    plan_table, _ = tables
+    text = (ROOT / "docs" / "scaling.md").read_text()
+    for which in plan_table.CHIPS:
+        inside = text.split(f"<!-- plan-{which} -->")[1].split(f"<!-- /plan-{which} -->")[0]
+        recorded = plan_table.recorded_text(which, plan_table.RESULTS)
+        # Settings may have changed since.
+        assert inside.split("Compiled by")[0].replace(" †", "").strip() == (
+            recorded.split("Compiled by")[0].replace(" †", "").strip()
+        )
+
+
+@pytest.mark.parametrize(
+    ("goal", "command"),
+    [("plan-table", "benchmarks/plan_table.py --recorded"), ("test-all", "pytest")],
+)
+def test_make_runs_the_command_with_the_compilers_installed(goal, command):
     done = subprocess.run(
-        ["make", "--dry-run", "plan-table", "ARGS=--kept"],
+        ["make", "--dry-run", "--always-make", goal, "ARGS=--recorded"],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,
     )
-    assert "benchmarks/plan_table.py --kept" in done.stdout
+    assert command in done.stdout
     assert "plan-tpu,plan-cuda" in done.stdout

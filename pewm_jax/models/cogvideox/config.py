@@ -233,11 +233,12 @@ class VAEConfig:
     """Share of a tile's height that overlaps with the next tile."""
     tile_overlap_width: float = 1 / 5
     """Share of a tile's width that overlaps with the next tile."""
-    convolution: Literal["auto", "stacked", "taps", "volume", "winograd"] = "auto"
-    """`volume`: 3D convolutions; `stacked`: 2D convolutions of three frames at once; `taps`: sums
-    of 2D convolutions, faster on XLA's CPU backend; `winograd`: half as many 2D convolutions;
-    `auto`: on a CPU `winograd` in float32 and `taps` in 16 bits, on TPUs `stacked`, elsewhere
-    `volume`."""
+    convolution: Literal["auto", "frames", "stacked", "taps", "volume", "winograd"] = "auto"
+    """`volume`: 3D convolutions; `stacked`: 2D convolutions of three frames at once; `frames`: the
+    same, one frame after the other, with the least memory; `taps`: sums of 2D convolutions, faster
+    on XLA's CPU backend; `winograd`: half as many 2D convolutions; `auto`: on a CPU `winograd` in
+    float32 and `taps` in 16 bits, on TPUs `frames` to decode and `stacked` to encode several
+    videos, elsewhere `volume`."""
 
     @property
     def spatial(self) -> int:

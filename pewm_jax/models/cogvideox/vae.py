@@ -202,8 +202,7 @@ def _encode_chunk(
         if "resample" in params[name]:
             x = layers.downsample(params[name]["resample"], x, in_time=level < halvings)
     x, new["mid"] = _resnets(config, params["mid"], x, None, past.get("mid", {}))
-    x = layers.norm(params["norm_out"], x, None, config.groups, layers.EPS)
-    x, new["conv_out"] = layers.causal_conv(config, params["conv_out"], x, past.get("conv_out"))
+    x, new["conv_out"] = layers.norm_conv(config, params, "_out", x, None, past.get("conv_out"))
     return x, new
 
 
@@ -221,9 +220,10 @@ def _decode_chunk(
         name = f"up_{level}"
         x, new[name] = _resnets(config, params[name], x, latents_BthwC, past.get(name, {}))
         if "resample" in params[name]:
-            x = layers.upsample(params[name]["resample"], x, in_time=level < halvings)
-    x = layers.norm(params["norm_out"], x, latents_BthwC, config.groups, layers.EPS)
-    x, new["conv_out"] = layers.causal_conv(config, params["conv_out"], x, past.get("conv_out"))
+            x = layers.upsample(config, params[name]["resample"], x, in_time=level < halvings)
+    x, new["conv_out"] = layers.norm_conv(
+        config, params, "_out", x, latents_BthwC, past.get("conv_out")
+    )
     return x, new
 
 

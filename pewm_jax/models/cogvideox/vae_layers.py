@@ -19,7 +19,14 @@ from pewm_jax.models.cogvideox.config import VAEConfig
 from pewm_jax.nn.layers import group_norm_affine
 from pewm_jax.nn.parameters import Leaf, convolution, levels
 from pewm_jax.nn.parameters import norm as norm_leaves
-from pewm_jax.nn.video_convolution import convolve_causal, convolve_frames, convolve_upsampled
+from pewm_jax.nn.video_convolution import (
+    convolve_causal,
+    convolve_frame_by_frame,
+    convolve_frames,
+    convolve_upsampled,
+    form,
+    frame_by_frame,
+)
 from pewm_jax.types import Array, Params
 
 EPS = 1e-6
@@ -50,28 +57,71 @@ def norm(
     maps their channels by ``scale_by`` and ``shift_by``. Mapping them first gives the same result
     with far less work.
     """
+    return _swish(x_BTHWC, *_affine(params, x_BTHWC, latents_BthwC, groups, eps))
+
+
+def norm_conv(
+    config: VAEConfig,
+    params: Params,
+    k: str,
+    x_BTHWC: Array,
+    latents_BthwC: Array | None,
+    past: Array | None,
+) -> tuple[Array, Array]:
+    """Apply ``norm`` and ``causal_conv``, whose parameters end in ``k``, in one pass if possible.
+
+    In the form ``frames`` one frame after the other is normalised and convolved.
+    """
+    eps = config.eps if latents_BthwC is None and k != "_out" else EPS
+    norms, kernel = params[f"norm{k}"], params[f"conv{k}"]
+    how = form(config.convolution, x_BTHWC.dtype, len(x_BTHWC), decodes=latents_BthwC is not None)
+    if how != "frames":
+        h = norm(norms, x_BTHWC, latents_BthwC, config.groups, eps)
+        return causal_conv(config, kernel, h, past)
+    parts = _affine(norms, x_BTHWC, latents_BthwC, config.groups, eps)
+    frames = x_BTHWC.shape[1]
+    per_frame = (jnp.broadcast_to(v, (len(v), frames, *v.shape[2:])) for v in parts)
+    return convolve_frame_by_frame(kernel, _swish, (x_BTHWC, *per_frame), past)
+
+
+def _affine(
+    params: Params, x_BTHWC: Array, latents_BthwC: Array | None, groups: int, eps: float
+) -> tuple[Array, Array]:
+    """Return factor and offset of ``norm``: (B, 1, 1, 1, C), or (B, T, h, w, C) with latents."""
     factor, offset = (
         v[:, None, None, None] for v in group_norm_affine(params, x_BTHWC, groups, eps)
     )
-    if latents_BthwC is not None:
-        latents = latents_BthwC.astype(jnp.float32)
-        by = pointwise(params["scale_by"], latents)
-        factor, offset = by * factor, by * offset + pointwise(params["shift_by"], latents)
-        factor, offset = (stretch(v, x_BTHWC.shape) for v in (factor, offset))
-    return jax.nn.silu(x_BTHWC.astype(jnp.float32) * factor + offset).astype(x_BTHWC.dtype)
+    if latents_BthwC is None:
+        return factor, offset
+    latents = latents_BthwC.astype(jnp.float32)
+    by = pointwise(params["scale_by"], latents)
+    factor, offset = by * factor, by * offset + pointwise(params["shift_by"], latents)
+    frames = x_BTHWC.shape[1]
+    return stretch(factor, frames), stretch(offset, frames)
 
 
-def stretch(x_BthwC: Array, shape: tuple[int, ...]) -> Array:
-    """Upsample (nearest) to (B, T, H, W, C); if T is odd, the first frame is not repeated."""
-    _, frames, height, width, _ = shape
-    t, h, w = x_BthwC.shape[1:4]
+def _swish(x_BTHWC: Array, factor_BThwC: Array, offset_BThwC: Array) -> Array:
+    """Return swish(x·factor + offset) in x's dtype; a factor counts for a cell of pixels."""
+    h, w = factor_BThwC.shape[2:4]
+    wide = x_BTHWC.astype(jnp.float32)
+    if h > 1 or w > 1:
+        # The pixels of a cell are axes of their own, so that no array is upsampled.
+        batch, frames, height, width, channels = x_BTHWC.shape
+        wide = wide.reshape(batch, frames, h, height // h, w, width // w, channels)
+        factor_BThwC, offset_BThwC = (
+            v[:, :, :, None, :, None] for v in (factor_BThwC, offset_BThwC)
+        )
+    out = jax.nn.silu(wide * factor_BThwC + offset_BThwC).astype(x_BTHWC.dtype)
+    return out.reshape(x_BTHWC.shape)
+
+
+def stretch(x_BthwC: Array, frames: int) -> Array:
+    """Repeat frames of latents to a number of frames; if it is odd, the first is not repeated."""
     if frames > 1 and frames % 2:
         first, rest = x_BthwC[:, :1], x_BthwC[:, 1:]
-        rest = jnp.repeat(rest, (frames - 1) // (t - 1), axis=1)
-        x_BthwC = jnp.concatenate([first, rest], 1)
-    else:
-        x_BthwC = jnp.repeat(x_BthwC, frames // t, axis=1)
-    return jnp.repeat(jnp.repeat(x_BthwC, height // h, axis=2), width // w, axis=3)
+        rest = jnp.repeat(rest, (frames - 1) // rest.shape[1], axis=1)
+        return jnp.concatenate([first, rest], 1)
+    return jnp.repeat(x_BthwC, frames // x_BthwC.shape[1], axis=1)
 
 
 def resnet(
@@ -86,12 +136,10 @@ def resnet(
     ``latents_BthwC`` condition the decoder's norms, and are None in the encoder. ``past`` is empty
     in the first chunk.
     """
-    eps = config.eps if latents_BthwC is None else EPS
     h, new = x_BTHWC, {}
     for k in "12":
-        h = norm(params[f"norm{k}"], h, latents_BthwC, config.groups, eps)
         name = f"conv{k}"
-        h, new[name] = causal_conv(config, params[name], h, past.get(name))
+        h, new[name] = norm_conv(config, params, k, h, latents_BthwC, past.get(name))
     if "shortcut" in params:
         x_BTHWC = pointwise(params["shortcut"], x_BTHWC)
     return x_BTHWC + h, new
@@ -110,13 +158,16 @@ def downsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
     return convolve_frames(params, x_BTHWC, stride=2, padding=((0, 1), (0, 1)))
 
 
-def upsample(params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
+def upsample(config: VAEConfig, params: Params, x_BTHWC: Array, *, in_time: bool) -> Array:
     """Double height and width (nearest) and convolve each frame; then repeat frames.
 
     If the number of frames is odd, the first one is not repeated. (Repeating frames after a
     convolution of single frames gives the same as before it, with less work.)
     """
-    x = convolve_upsampled(params, x_BTHWC)
+    if form(config.convolution, x_BTHWC.dtype, len(x_BTHWC), decodes=True) == "frames":
+        x = frame_by_frame(lambda frame: convolve_upsampled(params, frame), x_BTHWC)
+    else:
+        x = convolve_upsampled(params, x_BTHWC)
     frames = x.shape[1]
     if not in_time or frames == 1:
         return x

@@ -13,7 +13,7 @@ from pewm_jax.config import ConfigError, UserError
 from pewm_jax.models.cogvideox import vae, vae_layers
 from pewm_jax.models.cogvideox.convert import VAE
 from pewm_jax.models.cogvideox.vae import VAECodec
-from pewm_jax.nn import layers, video_convolution
+from pewm_jax.nn import layers, target, video_convolution
 from tests.helpers import randomised
 
 TINY = VAECodec(
@@ -163,10 +163,28 @@ def test_every_form_of_a_convolution_agrees(frames):
     }
     volume, *others = (
         video_convolution.convolve(form, kernel, x)
-        for form in ("volume", "stacked", "taps", "winograd")
+        for form in ("volume", "stacked", "frames", "taps", "winograd")
     )
     for other in others:
         np.testing.assert_allclose(other, volume, atol=1e-4)
+
+
+@pytest.mark.parametrize("frames", [1, 17])
+def test_frames_are_normalised_and_convolved_one_after_the_other(params, frames):
+    forms = [dataclasses.replace(TINY, convolution=form) for form in ("volume", "frames")]
+    means = [vae.encode(config, params, video(frames))[0] for config in forms]
+    np.testing.assert_allclose(*means, atol=1e-4)
+    decoded = [vae.decode(config, params, means[0]) for config in forms]
+    np.testing.assert_allclose(*decoded, atol=1e-4)
+
+
+def test_on_tpus_the_decoder_computes_frame_by_frame():
+    with target.use(target.Target("tpu")):
+        found = [
+            video_convolution.form("auto", jnp.bfloat16, videos, decodes=decodes)
+            for videos, decodes in ((1, True), (2, True), (2, False), (1, False))
+        ]
+    assert found == ["frames", "frames", "stacked", "volume"]
 
 
 def test_a_doubled_frame_is_convolved_without_being_made():

@@ -116,6 +116,9 @@ def test_text_and_encoder_matter_and_depth_goes_through_the_vae(world):
     rgb, depth = rgbd.decode_rgbd(model, params, latents)
     assert rgb.shape == (1, 9, 16, 24, 3)
     assert depth.shape == (1, 9, 16, 24)
+    compiled = jax.jit(rgbd.decode_rgbd, static_argnums=0)(model, params, latents)
+    np.testing.assert_allclose(compiled[0], rgb, atol=1e-4)
+    np.testing.assert_allclose(compiled[1], depth, rtol=1e-3)
     one = model.memory.encoder.encode(params["encoder"], frames.rgb_THWC / 127.5 - 1)
     assert one.shape == (9, 2, 2, 16)
 
