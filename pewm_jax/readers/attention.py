@@ -71,7 +71,7 @@ def _ray_channels(model: AssembledModel) -> int:
     return CameraConfig().channels(model) * places.patch**2 * places.patch_t
 
 
-def _embeddings(model: AssembledModel) -> tuple[modules.nn.Dense, modules.nn.Dense]:
+def _embeddings(model: AssembledModel) -> tuple[modules.Dense, modules.Dense]:
     """Return the linear layers of rays (one vector per video token) and map tokens."""
     dtype = jnp.dtype(model.dtype)
     camera = modules.dense(model.backbone.places.width // 2, dtype, "camera")

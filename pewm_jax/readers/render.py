@@ -103,7 +103,7 @@ def token_channels(model: AssembledModel) -> int:
     return cell_channels(model) * places.patch_t * places.patch**2
 
 
-def _embeddings(model: AssembledModel) -> dict[str, modules.nn.Dense]:
+def _embeddings(model: AssembledModel) -> dict[str, modules.Dense]:
     """Return the linear layers between views and tokens, by name."""
     config, dtype = _settings(model), jnp.dtype(model.dtype)
     found = {"embed_1": config.picture_width, "embed_2": config.picture_width}
