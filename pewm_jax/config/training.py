@@ -247,6 +247,12 @@ class TrainSettings:
     in a rollout: the clip is run backwards in one denoising step from a random level of noise, and
     starts from the model's prediction, without gradient, of its first frame (`worlds/objective.py`
     documents the limits). Costs a forward pass for that share."""
+    denoised_lpips: float = 0.0
+    """Weight of LPIPS between denoised and true colours, of one frame of every clip; 0 leaves it
+    out. Noisier clips count less. It makes few sampling steps sharp, and a step slower, so use it
+    in a second run that starts from a trained model. For the stages `joint` and `adapt`."""
+    denoised_lpips_net: Literal["alex", "vgg"] = "vgg"
+    """The network of that LPIPS (`pip install 'pewm-jax[metrics]'`). Judge by the other one."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""
     grace_s: float = 30.0
@@ -267,6 +273,10 @@ class TrainSettings:
             (lambda x: 0 <= x <= 1, "a share of clips in [0, 1]", *SHARES),
         ):
             require_fields(self, "train", accepts, hint, *names)
+        require(
+            self.denoised_lpips >= 0,
+            f"train.denoised_lpips is {self.denoised_lpips}: use 0 or more.",
+        )
         for name, reason in self.ZERO.items():
             value = getattr(self, name)
             require(value == 0, f"train.{name} is {value}: {reason}, use 0.")

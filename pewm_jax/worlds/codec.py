@@ -58,7 +58,8 @@ class CodecTrainConfig(TrainSettings):
     """Training of the codec: reconstruction, then the distribution of its latents."""
 
     ZERO: ClassVar[dict[str, str]] = {
-        "preview_every": "a codec imagines nothing (pewm-jax evaluate prints its numbers)"
+        "preview_every": "a codec imagines nothing (pewm-jax evaluate prints its numbers)",
+        "denoised_lpips": "it is for models that denoise",
     }
 
     run: str = "runs/codec"

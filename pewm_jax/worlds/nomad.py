@@ -40,7 +40,10 @@ SMALL = 1e-2
 class NomadTrainConfig(TrainSettings):
     """Training of the policy by imitation of recorded walks."""
 
-    ZERO: ClassVar[dict[str, str]] = {"preview_every": "a policy imagines nothing"}
+    ZERO: ClassVar[dict[str, str]] = {
+        "preview_every": "a policy imagines nothing",
+        "denoised_lpips": "it is for models that imagine",
+    }
 
     run: str = "runs/nomad"
     """Folder of this run: checkpoints, logs, numbers."""

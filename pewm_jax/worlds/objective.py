@@ -25,10 +25,12 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, signal_from_rgb
 from pewm_jax.config import AssembledModel, TrainSettings, UserError
 from pewm_jax.config.parts import Noise
+from pewm_jax.errors import require
 from pewm_jax.memory import interface as memories
+from pewm_jax.models.lpips import model as lpips
 from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MemoryReadout, Params, View
-from pewm_jax.worlds import perturbation, world_model
+from pewm_jax.worlds import codec_losses, perturbation, world_model
 from pewm_jax.worlds.control import require_actions
 
 
@@ -105,19 +107,21 @@ def loss(
     memory: bool,
     history: int = 1,
     blind: float = 0.0,
+    perceptual: bool = False,
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of one batch and its parts.
 
     ``train`` has the settings of noise on the observed frame, chained clips, hidden memories and
     errors in them. Warped latents of the observed frame get noise of the same size as its colours.
     The first ``history`` frames of a clip are observed; a share ``blind`` of the clips lacks the
-    input of guidance; ``memory`` is True in stage 2.
+    input of guidance; ``memory`` is True in stage 2, and ``perceptual`` in stages whose loss has
+    ``train.denoised_lpips``.
 
     Returns:
-        ``(loss, {"loss_rgb", "loss_depth"})``: the weighted squared error of the noise's target,
-        averaged over colour and over depth where it was measured. If the denoiser works without
-        depth (``clip.depth``), only colour counts. Known latent frames of the backbone
-        (``Conditioning.known_Bt``) do not count.
+        ``(loss, {"loss_rgb", "loss_depth"})``, and ``lpips`` if it has a weight: the weighted
+        squared error of the noise's target, averaged over colour and over depth where measured.
+        If the denoiser works without depth (``clip.depth``), only colour counts. Known latent
+        frames of the backbone (``Conditioning.known_Bt``) do not count.
     """
     frames = as_signal(clip.frames)
     x0 = clip.extras.get("latents_thwC")
@@ -153,11 +157,17 @@ def loss(
         rgb = (error[..., :split] * counted).mean() / jnp.maximum(counted.mean(), 1e-6)
         measured = measured * counted
     depth = (error[..., split:] * measured).sum() / jnp.maximum(measured.sum(), 1)
-    if not model.clip.depth:
-        return rgb, {"loss_rgb": rgb, "loss_depth": depth}
+    measures = {"loss_rgb": rgb, "loss_depth": depth}
     channels = error.shape[-1]
-    total = (rgb * split + depth * (channels - split)) / channels
-    return total, {"loss_rgb": rgb, "loss_depth": depth}
+    total = rgb
+    if model.clip.depth:
+        total = (rgb * split + depth * (channels - split)) / channels
+    if not (perceptual and train.denoised_lpips):
+        return total, measures
+    made = model.noise.to_x0(prediction, x_t, times)
+    frame_key, net = jax.random.fold_in(key, 8), train.denoised_lpips_net
+    distance = denoised_distance(model, net, params, clip, made, times, frame_key)
+    return total + train.denoised_lpips * distance, measures | {"lpips": distance}
 
 
 def _readout(
@@ -258,6 +268,55 @@ without_memory = functools.partial(loss, memory=False)
 """The loss of stage 1."""
 with_memory = functools.partial(loss, memory=True)
 """The loss of stage 2."""
+joint = functools.partial(loss, memory=True, perceptual=True)
+"""The loss of stage ``joint``."""
+
+
+def perceptual_weights(model: AssembledModel, train: TrainSettings) -> Params | None:
+    """Return the weights of LPIPS that ``train.denoised_lpips`` needs, or None without it.
+
+    Raises:
+        UserError: a latent frame is not one frame of the video; see also
+            ``codec_losses.lpips_weights``.
+    """
+    if not train.denoised_lpips:
+        return None
+    require(
+        model.codec.temporal == 1,
+        f"train.denoised_lpips is {train.denoised_lpips}, but the codec makes one latent frame of "
+        f"{model.codec.temporal} frames: use a codec of single frames, or 0.",
+    )
+    return codec_losses.lpips_weights(train.denoised_lpips_net, model.clip)
+
+
+def denoised_distance(
+    model: AssembledModel,
+    net: lpips.Net,
+    params: Params,
+    clip: Clip,
+    x0_BthwC: Array,
+    times: Array,
+    key: Array,
+) -> Array:
+    """Return LPIPS between denoised and true colours of one frame, the mean over clips.
+
+    The frame is one of all but the first, the same in all clips. A clip's weight is the share of
+    the signal in the variance of its noisy latents: in noise nothing can be recognised, and LPIPS
+    would reward any sharp picture. ``params`` has the codec, and under ``lpips`` the network.
+    """
+    at = jax.random.randint(key, (), 1, x0_BthwC.shape[1])
+
+    def frame(x_BT: Array) -> Array:
+        return jax.lax.dynamic_slice_in_dim(x_BT, at, 1, axis=1)
+
+    colours = frame(x0_BthwC)[..., : model.codec.rgb_channels].astype(model.dtype)
+    made = model.codec.decode(params.get("codec", {}), colours)[:, 0].astype(jnp.float32)
+    truth = signal_from_rgb(frame(clip.frames.rgb_THWC))[:, 0]
+    distance_B = lpips.apply(net, params["lpips"], made, truth)
+    ones, zeros = jnp.ones_like(x0_BthwC[..., :1]), jnp.zeros_like(x0_BthwC[..., :1])
+    signal, noise = model.noise.corrupt(ones, zeros, times), model.noise.corrupt(zeros, ones, times)
+    share_B = (signal**2 / (signal**2 + noise**2)).mean((1, 2, 3, 4))
+    return (share_B * distance_B).mean()
 
 
 def first_frames(

@@ -10,6 +10,7 @@ bidirectional, all its frames attend to all its actions, but not to those of lat
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, ClassVar
 
 import jax
@@ -130,12 +131,26 @@ class EgoWM(AssembledModel):
         return world_model.init(self, key, memory=False)
 
     def loss(
-        self, train: TrainSettings, params: Params, clip: Clip, key: Array
+        self,
+        train: TrainSettings,
+        params: Params,
+        clip: Clip,
+        key: Array,
+        *,
+        perceptual: bool = False,
     ) -> tuple[Array, dict[str, Array]]:
         """Return the backbone's own loss, of clips with actions; see ``objective.loss``."""
         assert isinstance(train, EgoWMTrainConfig)
         return objective.loss(
-            self, train, params, clip, key, memory=False, history=self.history, blind=train.blind
+            self,
+            train,
+            params,
+            clip,
+            key,
+            memory=False,
+            history=self.history,
+            blind=train.blind,
+            perceptual=perceptual,
         )
 
     def prepare(self, params: Params, clip: Clip) -> Clip:
@@ -162,6 +177,8 @@ class EgoWM(AssembledModel):
             name="adapt",
             number=2,
             rules=((r"(backbone|control)/.*", TRAIN), (r"(codec|image|text)/.*", FREEZE)),
+            loss=functools.partial(EgoWM.loss, perceptual=True),
+            extra_weights=objective.perceptual_weights,
             optional=False,
             rates=((r"control/.*", self.control.rate),),
         )

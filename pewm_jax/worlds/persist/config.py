@@ -31,7 +31,8 @@ class PersistTrainConfig(TrainSettings):
     """Training of the networks, one after the other; the codec of images is frozen."""
 
     ZERO: ClassVar[dict[str, str]] = dict.fromkeys(
-        ("hidden", "memory_errors", "chained"), "it is for worlds with memory blocks"
+        ("hidden", "memory_errors", "chained", "denoised_lpips"),
+        "it is for worlds with memory blocks",
     )
 
     run: str = "runs/persist"

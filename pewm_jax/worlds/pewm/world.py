@@ -150,6 +150,8 @@ JOINT = dataclasses.replace(
     name="joint",
     number=3,
     rules=((r"(backbone|control|memory)/.*", TRAIN), (FROZEN, FREEZE)),
+    loss=objective.joint,
+    extra_weights=objective.perceptual_weights,
     optional=True,
 )
 GATE = Stage(
