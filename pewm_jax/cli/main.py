@@ -121,7 +121,7 @@ COMMANDS = {
         f"{CLI}.studies:practice",
     ),
     "conditioning": Command(
-        "train and score ways of giving actions to a network: EgoWM's ablation",
+        "train and score ways of giving actions to a network (EgoWM)",
         f"{CLI}.studies:ConditioningSettings",
         f"{CLI}.studies:conditioning",
     ),
@@ -197,7 +197,7 @@ COMMANDS = {
 GROUPS = {
     "data": "collect, import, validate, show and export episodes",
     "memory": "compute the image encoder's features of a data set once",
-    "convert": "import CogVideoX, SVD, Cosmos, DINOv2 or adapters; export weights",
+    "convert": "import CogVideoX, SVD, Cosmos, DINOv2, adapters; export weights",
     "convert import": "read a checkpoint of another library",
     "convert export": "write weights for another program",
 }

@@ -276,9 +276,11 @@ def test_the_command_names_every_subcommand_and_what_it_does(capsys):
     assert {name.split()[0] for name in command.COMMANDS} == set(COMMANDS)
     assert command.main(["--help"]) == 0
     out = capsys.readouterr().out
-    for name, about in command.below("").items():
-        assert f"\n  {name:<10}{about}\n" in out
-        assert len(f"  {name:<10}{about}") <= 80
+    commands = command.below("")
+    width = max(map(len, commands)) + 2
+    for name, about in commands.items():
+        assert f"\n  {name:<{width}}{about}\n" in out
+        assert len(f"  {name:<{width}}{about}") <= 80
     assert command.main([]) == 2
     assert capsys.readouterr().out == out
     assert command.main(["--version"]) == 0
