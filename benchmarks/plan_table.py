@@ -41,6 +41,8 @@ from pewm_jax.train.log import duration
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 RESULTS = Path(__file__).with_suffix(".json")
 """The recorded reports: name of a program → its ``Piece``, its settings' hash, the report."""
+ADDED = {"denoised_lpips": 0.0, "denoised_lpips_net": "vgg"}
+"""Settings of training that older records lack, with the values that change no program."""
 PRESETS = ("pewm_2b", "pewm_5b", "pewm_5b_i2v", "egowm_svd", "egowm_cosmos2b", "persist_xl")
 TRAINING, INFERENCE = "training", "inference"
 CHIPS = {TRAINING: ("h100", "v5p"), INFERENCE: ("h100", "a100", "v5e", "v6e")}
@@ -110,6 +112,9 @@ class Piece:
         """Return the settings that programs depend on."""
         settings = serialize.to_dict(self.config)
         del settings["evaluate"]
+        for name, value in ADDED.items():
+            if settings["train"].get(name) == value:
+                del settings["train"][name]
         return settings
 
     @property
