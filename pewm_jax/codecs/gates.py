@@ -20,7 +20,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.nn.convolution import convolve
+from pewm_jax.nn.convolution import convolve_layer
 from pewm_jax.types import Array, Params
 
 BLOCKS = 3
@@ -83,14 +83,6 @@ def apply(params: Params, decoded_NHWC: Array, rendered_NHWC: Array, seen_NHW: A
     weight = jax.nn.sigmoid(out[..., :2] + INITIAL_LOGIT)
     weight = jnp.concatenate([jnp.repeat(weight[..., :1], 3, -1), weight[..., 1:]], -1)
     return decoded_NHWC + seen * (weight * difference + out[..., 2:])
-
-
-def convolve_layer(weights: Params, x_NHWC: Array) -> Array:
-    """Apply a convolution with its bias; the frame is padded with zeros."""
-    kernel, bias = (weights[name].astype(x_NHWC.dtype) for name in ("kernel", "bias"))
-    if kernel.shape[0] == 1:
-        return x_NHWC @ kernel[0, 0] + bias
-    return convolve(x_NHWC, kernel) + bias
 
 
 def residual_block(weights: Params, x_NHWC: Array) -> Array:

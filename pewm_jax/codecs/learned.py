@@ -19,13 +19,13 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.codecs import gates
 from pewm_jax.codecs.gates import (
-    convolve_layer,
     depth_to_space,
     residual_block,
     space_to_depth,
 )
 from pewm_jax.config.parts import Codec, Rules
 from pewm_jax.errors import UserError, require, require_positive
+from pewm_jax.nn.convolution import convolve_layer
 from pewm_jax.types import Array, Params
 
 PATCH = 4

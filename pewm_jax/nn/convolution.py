@@ -16,10 +16,12 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
-from pewm_jax.types import Array
+from pewm_jax.types import Array, Params
 
 PICTURES = ("NHWC", "HWIO", "NHWC")
 GRIDS = ("NXYZC", "XYZIO", "NXYZC")
+GROUP = 2**21
+"""Numbers in the shifted copies of a group of pictures."""
 Form = Literal["auto", "xla", "products"]
 """How a 3D convolution is computed: by XLA, as products, or as products on a CPU alone."""
 
@@ -44,13 +46,29 @@ def _convolve_backward(saved: tuple[Array, Array], out_NHWO: Array) -> tuple[Arr
 
 
 def _kernel_by_product(x_NHWC: Array, kernel: Array, out_NHWO: Array) -> Array:
+    """Sum over groups of pictures, so that the copies of a group fit a processor's cache."""
     side, _, inward, outward = kernel.shape
-    _, height, width, _ = x_NHWC.shape
+    count, height, width, _ = x_NHWC.shape
     around = side // 2
-    padded = jnp.pad(x_NHWC, ((0, 0), (around, around), (around, around), (0, 0)))
-    shifted = [padded[:, i : i + height, j : j + width] for i in range(side) for j in range(side)]
-    columns = jnp.concatenate(shifted, -1).reshape(-1, side * side * inward)
-    product = out_NHWO.reshape(-1, outward).T @ columns
+
+    def of_group(x: Array, out: Array) -> Array:
+        padded = jnp.pad(x, ((0, 0), (around, around), (around, around), (0, 0)))
+        shifted = [
+            padded[:, i : i + height, j : j + width] for i in range(side) for j in range(side)
+        ]
+        beside = jnp.concatenate(shifted, -1).reshape(-1, side * side * inward)
+        return out.reshape(-1, outward).T @ beside
+
+    wanted = max(1, GROUP // (height * width * side * side * inward))
+    size = max(k for k in range(1, min(wanted, count) + 1) if count % k == 0)
+    if size == count:
+        product = of_group(x_NHWC, out_NHWO)
+    else:
+        groups = (x.reshape(-1, size, *x.shape[1:]) for x in (x_NHWC, out_NHWO))
+        start = jnp.zeros((outward, side * side * inward), x_NHWC.dtype)
+        product, _ = jax.lax.scan(
+            lambda total, group: (total + of_group(*group), None), start, tuple(groups)
+        )
     return product.T.reshape(kernel.shape)
 
 
@@ -63,6 +81,14 @@ def _kernel_by_convolution(x_NHWC: Array, kernel: Array, out_NHWO: Array) -> Arr
 
 
 convolve.defvjp(_convolve_forward, _convolve_backward)
+
+
+def convolve_layer(weights: Params, x_NHWC: Array) -> Array:
+    """Apply a convolution with its bias; the frame is padded with zeros."""
+    kernel, bias = (weights[name].astype(x_NHWC.dtype) for name in ("kernel", "bias"))
+    if kernel.shape[0] == 1:
+        return x_NHWC @ kernel[0, 0] + bias
+    return convolve(x_NHWC, kernel) + bias
 
 
 def convolve_grid(x_NXYZC: Array, kernel_XYZIO: Array, form: Form = "auto") -> Array:
