@@ -72,6 +72,7 @@ BUILT_IN: dict[str, dict[str, str]] = {
     },
     "backbone": {
         "dit": "pewm_jax.models.cogvideox.backbone:DiTBackbone",
+        "uvit": "pewm_jax.models.uvit:UViTBackbone",
         "svd_unet": "pewm_jax.models.svd.unet:SVDUNetBackbone",
         "cosmos": "pewm_jax.models.cosmos.backbone:CosmosBackbone",
         "persist": "pewm_jax.models.persist.nets:PersistNetsConfig",

@@ -1,4 +1,4 @@
-"""The pixel codec: no parameters, exactly invertible.
+"""The pixel codec: exactly invertible, without parameters but those of an optional gate.
 
 Space-to-depth of s × s pixels, and q frames folded into one latent frame, with CogVideoX's frame
 rule: q·k + 1 frames become k + 1 latent frames, the first of which holds q copies of frame 0.
@@ -11,9 +11,11 @@ from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import PartitionSpec as P
 
-from pewm_jax.config.parts import Codec
-from pewm_jax.errors import require_positive
+from pewm_jax.codecs import gates
+from pewm_jax.config.parts import Codec, Rules
+from pewm_jax.errors import require, require_positive
 from pewm_jax.geometry.cameras import fold_frames
 from pewm_jax.types import Array, Params
 
@@ -22,12 +24,19 @@ from pewm_jax.types import Array, Params
 class PixelConfig(Codec):
     """Space-to-depth and temporal fold: no parameters, exactly invertible."""
 
+    SHARDING: ClassVar[Rules] = (
+        (r"codec/gate/.*/kernel", P(None, "fsdp")),
+        (r"codec/gate/.*/bias", P()),
+    )
     PIXELWISE: ClassVar[bool] = True
 
     spatial: int = 4
     """Pixels per latent cell, along height and along width."""
     temporal: int = 4
     """Frames per latent frame after the first."""
+    gate: int = 0
+    """Channels of the gate, which blends frames with the rendered memory (such as 48); 0 for no
+    gate. Stage `gate` trains it; at first it prefers the memory."""
 
     @property
     def rgb_channels(self) -> int:
@@ -42,6 +51,17 @@ class PixelConfig(Codec):
     def __post_init__(self):
         """Validate."""
         require_positive(self, "codec", "spatial", "temporal")
+        require(self.gate >= 0, f"codec.gate is {self.gate}: use 0 (no gate) or more channels.")
+
+    def init(self, key: Array) -> Params:
+        """Return random parameters of the gate, if there is one."""
+        return {"gate": gates.init(self.gate, key)} if self.gate else {}
+
+    def mix(
+        self, params: Params, decoded_NHWC: Array, rendered_NHWC: Array, seen_NHW: Array
+    ) -> Array:
+        """Blend decoded and rendered frames (N, H, W, 4) by the gate; see ``gates.apply``."""
+        return gates.apply(params["gate"], decoded_NHWC, rendered_NHWC, seen_NHW)
 
     def encode(self, params: Params, video_BTHWC: Array, *, condition: bool = False) -> Array:
         """Encode a video (B, q·k + 1, H, W, C); see ``fold``."""

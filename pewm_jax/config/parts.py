@@ -50,6 +50,8 @@ class InjectionPoints:
         time: E, channels of the time embedding (B, E).
         patch: latent cells per token, along height and along width.
         patch_t: latent frames per token.
+        cell_width: channels of the embedded input at every latent cell, to which a reader may add;
+            0 where the input is embedded as tokens alone.
     """
 
     count: int
@@ -57,6 +59,7 @@ class InjectionPoints:
     time: int
     patch: int = 1
     patch_t: int = 1
+    cell_width: int = 0
 
 
 class Backbone(Settings):

@@ -69,11 +69,14 @@ class Readers:
             ``time_BE`` may be (B, t, E), one embedding for each token in time.
         params: the parameters of ``block``, stacked over places.
         added_BND: added to the embedded video tokens before the first block.
+        added_BthwC: added to the embedded input at every latent cell; only for backbones with
+            ``places.cell_width``, which is C.
     """
 
     block: Callable[[Any, Array, Array], Array] | None = None
     params: Any = None
     added_BND: Array | None = None
+    added_BthwC: Array | None = None
 
 
 NO_READERS = Readers()

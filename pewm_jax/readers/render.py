@@ -64,14 +64,16 @@ class RenderBlock(nn.Module):
 
 
 REPLICATED = P()
+CELLS = ("cell_1", "cell_2")
+"""The layers between the views and the cells of a backbone that embeds its input cell by cell."""
 
 _RULES = (
     (r"memory/render/blocks/(linear|up)/kernel", P("fsdp", "tensor")),
     (r"memory/render/blocks/(linear|up)/bias", P("tensor")),
     (r"memory/render/blocks/down/kernel", P("tensor", "fsdp")),
     (r"memory/render/blocks/(down/bias|norm/(scale|bias))", REPLICATED),
-    (r"memory/render/(embed_[12]|added)/kernel", P(None, "fsdp")),
-    (r"memory/render/(reduce/(kernel|bias)|(embed_[12]|added)/bias)", REPLICATED),
+    (r"memory/render/(embed_[12]|cell_[12]|added)/kernel", P(None, "fsdp")),
+    (r"memory/render/(reduce/(kernel|bias)|(embed_[12]|cell_[12]|added)/bias)", REPLICATED),
 )
 
 
@@ -108,7 +110,11 @@ def _embeddings(model: AssembledModel) -> dict[str, modules.Dense]:
     config, dtype = _settings(model), jnp.dtype(model.dtype)
     found = {"embed_1": config.picture_width, "embed_2": config.picture_width}
     made = {name: modules.dense(width, dtype, name) for name, width in found.items()}
-    made["added"] = modules.dense(model.backbone.places.width, dtype, "added", zero=True)
+    places = model.backbone.places
+    made["added"] = modules.dense(places.width, dtype, "added", zero=True)
+    if places.cell_width:
+        for name in CELLS:
+            made[name] = modules.dense(places.cell_width, dtype, name, zero=name == CELLS[-1])
     if _reduces(model):
         made["reduce"] = modules.dense(config.reduced, dtype, "reduce")
     return made
@@ -203,11 +209,14 @@ class RenderConfig(Reader):
             "embed_2": self.picture_width,
             "added": self.picture_width,
             "reduce": model.memory.rendered_channels,
+            "cell_1": cell_channels(model),
+            "cell_2": places.cell_width,
         }
         params: Params = {}
-        for place, (name, layer) in enumerate(sorted(_embeddings(model).items())):
+        layers = _embeddings(model)
+        for place, name in enumerate(sorted(layers, key=lambda name: (name in CELLS, name))):
             example = jnp.zeros((1, widths[name]))
-            params[name] = layer.init(jax.random.fold_in(key, place), example)["params"]
+            params[name] = layers[name].init(jax.random.fold_in(key, place), example)["params"]
         if self.blocks:
             example = (
                 jnp.zeros((1, 1, places.width)),
@@ -239,8 +248,12 @@ class RenderConfig(Reader):
         # A clip whose cameras see nothing of the memory is not changed.
         shown = (seen_B | (not model.memory.REMEMBERS))[:, None, None]
         added = layout.spread(jnp.where(shown, embed("added", picture), 0))
+        at_cells = None
+        if places.cell_width:
+            at_cells = embed("cell_2", jax.nn.silu(embed("cell_1", read_BthwC)))
+            at_cells = jnp.where(shown[..., None, None], at_cells, 0)
         if not self.blocks:
-            return Readers(added_BND=added)
+            return Readers(added_BND=added, added_BthwC=at_cells)
         picture = layout.spread(picture)
         block = RenderBlock(self.mlp_ratio, layout)
 
@@ -248,7 +261,7 @@ class RenderConfig(Reader):
             out: Array = block.apply({"params": layer}, video, time, picture)
             return jnp.where(shown, out, video)
 
-        return Readers(read, weights["blocks"], added)
+        return Readers(read, weights["blocks"], added, at_cells)
 
     def __post_init__(self):
         """Validate."""
@@ -285,7 +298,9 @@ class BothConfig(AttentionConfig, RenderConfig):
         attend = AttentionConfig.prepare(self, model, params, readout, camera, rays_BthwC)
         render = RenderConfig.prepare(self, model, params, readout, camera, rays_BthwC)
         if render.block is None:
-            return dataclasses.replace(attend, added_BND=render.added_BND)
+            return dataclasses.replace(
+                attend, added_BND=render.added_BND, added_BthwC=render.added_BthwC
+            )
 
         def read(layer: Params, video: Array, time: Array) -> Array:
             assert attend.block is not None
@@ -294,7 +309,7 @@ class BothConfig(AttentionConfig, RenderConfig):
             return render.block(layer["render"], video, time)
 
         stacked = {"attend": attend.params, "render": render.params}
-        return Readers(read, stacked, render.added_BND)
+        return Readers(read, stacked, render.added_BND, render.added_BthwC)
 
     def check(self, model: Any) -> None:
         """Refuse what either of the two refuses."""
