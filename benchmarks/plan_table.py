@@ -41,8 +41,14 @@ from pewm_jax.train.log import duration
 PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
 RESULTS = Path(__file__).with_suffix(".json")
 """The recorded reports: name of a program → its ``Piece``, its settings' hash, the report."""
-ADDED = {"denoised_lpips": 0.0, "denoised_lpips_net": "vgg"}
-"""Settings of training that older records lack, with the values that change no program."""
+ADDED = {
+    "denoised_lpips": 0.0,
+    "denoised_lpips_net": "vgg",
+    "frames": 0,
+    "whole": 0.0,
+    "last_alone": False,
+}
+"""Settings that older records lack, with the values that change no program."""
 PRESETS = ("pewm_2b", "pewm_5b", "pewm_5b_i2v", "egowm_svd", "egowm_cosmos2b", "persist_xl")
 TRAINING, INFERENCE = "training", "inference"
 CHIPS = {TRAINING: ("h100", "v5p"), INFERENCE: ("h100", "a100", "v5e", "v6e")}
@@ -112,10 +118,7 @@ class Piece:
         """Return the settings that programs depend on."""
         settings = serialize.to_dict(self.config)
         del settings["evaluate"]
-        for name, value in ADDED.items():
-            if settings["train"].get(name) == value:
-                del settings["train"][name]
-        return settings
+        return _without(settings, ADDED)
 
     @property
     def order(self) -> tuple[Any, ...]:
@@ -131,6 +134,15 @@ class Piece:
                 self.config, self.name, self.chip, self.devices, self.slices
             )
         return target_compiler.compile_inference(self.config, self.name, self.chip)
+
+
+def _without(settings: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Return settings, and those of their sections, without those that have one of the values."""
+    return {
+        name: _without(value, values) if isinstance(value, dict) else value
+        for name, value in settings.items()
+        if name not in values or value != values[name]
+    }
 
 
 def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:

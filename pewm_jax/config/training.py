@@ -116,6 +116,11 @@ class StageConfig:
     micro_batches: int = 1
     """Parts of a batch that are computed one after the other, so that activations take less memory
     (gradient accumulation). A step uses the mean of their losses and gradients."""
+    frames: int = 0
+    """Frames that a step imagines of each clip, drawn at random; 0 for all of them. A step of few
+    frames is faster, and frames of one clip resemble each other."""
+    whole: float = 0.0
+    """Share of the steps that imagine whole clips, where ``frames`` is set."""
     learning_rate: float = 1e-3
     """Peak learning rate of Adam."""
     warmup: int = 50
@@ -133,6 +138,11 @@ class StageConfig:
             f"micro_batches is {self.micro_batches}: use a divisor of the batch, {self.batch}.",
         )
         require(self.learning_rate > 0, "learning_rate must be above 0.")
+        require(
+            self.frames >= 0 and 0 <= self.whole <= 1,
+            f"frames is {self.frames} and whole {self.whole}: use 0 (all frames) or more, and a "
+            "share from 0 to 1.",
+        )
         require(self.warmup >= 0, f"warmup is {self.warmup}: use 0 (none) or more steps.")
 
 
@@ -179,6 +189,8 @@ class TrainSettings:
 
     ZERO: ClassVar[dict[str, str]] = {}
     """Settings that must be 0 for a task → the reason."""
+    DRAWS: ClassVar[tuple[str, ...]] = ()
+    """Stages that can imagine frames drawn from a clip (``StageConfig.frames``)."""
 
     run: str = "runs/demo"
     """Folder of this run: checkpoints, logs, images, report."""
@@ -303,11 +315,26 @@ class TrainSettings:
 
     def require_fit(self, model: Any) -> None:
         """Refuse settings that do not go together with the world's."""
+        stages = {name: x for name, x in vars(self).items() if isinstance(x, StageConfig)}
+        drawing = [name for name, settings in stages.items() if settings.frames]
+        for name in drawing:
+            require(
+                name in self.DRAWS,
+                f"train.{name}.frames is {stages[name].frames}, but this stage takes whole clips: "
+                "set it to 0.",
+            )
+        require(
+            not drawing or (model.codec.temporal == 1 and not model.control.actions),
+            f"train.{''.join(drawing[:1])}.frames draws single frames of a clip, which needs "
+            "cameras as control and a codec of single frames: set it to 0.",
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig(TrainSettings):
     """Training of PEWM in two stages, as in the paper, and an optional third."""
+
+    DRAWS: ClassVar[tuple[str, ...]] = ("stage1", "stage2", "joint")
 
     stage1: StageConfig = StageConfig()
     """The backbone is trained without memory: domain, camera control, RGB-D."""

@@ -264,11 +264,70 @@ def hide_readout(readout: MemoryReadout, kept_B: Array) -> MemoryReadout:
     return MemoryReadout(**{part: masked(getattr(readout, part), m) for part, m in names.items()})
 
 
-without_memory = functools.partial(loss, memory=False)
+def of_stage(
+    model: AssembledModel,
+    train: TrainSettings,
+    params: Params,
+    clip: Clip,
+    key: Array,
+    *,
+    stage: str,
+    memory: bool,
+    perceptual: bool = False,
+) -> tuple[Array, dict[str, Array]]:
+    """Return ``loss`` of the frames that a step of this stage imagines (``StageConfig.frames``).
+
+    Clips of drawn frames are not chained.
+    """
+    settings, length = getattr(train, stage), model.clip.frames - 1
+    of_clips = functools.partial(loss, memory=memory, perceptual=perceptual)
+    if not 0 < settings.frames < length:
+        return of_clips(model, train, params, clip, key)
+
+    def of_drawn() -> tuple[Array, dict[str, Array]]:
+        shorter, drawn = draw_frames(model, clip, settings.frames, jax.random.fold_in(key, 9))
+        unchained = dataclasses.replace(train, chained=0.0)
+        return of_clips(shorter, unchained, params, drawn, key)
+
+    if not settings.whole:
+        return of_drawn()
+    whole = jax.random.bernoulli(jax.random.fold_in(key, 10), settings.whole)
+    return jax.lax.cond(whole, lambda: of_clips(model, train, params, clip, key), of_drawn)
+
+
+def draw_frames(
+    model: AssembledModel, clip: Clip, count: int, key: Array
+) -> tuple[AssembledModel, Clip]:
+    """Return the model and a batch of clips of the observed frame and ``count`` others, in order.
+
+    They are drawn at random, the same in all clips of the batch.
+    """
+    length = clip.frames.depth_THW.shape[1]
+    drawn = jnp.sort(jax.random.choice(key, length - 1, (count,), replace=False)) + 1
+    rows = jnp.concatenate([jnp.zeros((1,), drawn.dtype), drawn])
+
+    def take(part: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.take(x, rows, 1), part)
+
+    extras = dict(clip.extras)
+    for name in ("latents_thwC", "everywhere_thwC"):
+        if name in extras:
+            extras[name] = take(extras[name])
+    if "readout" in extras:
+        shown: MemoryReadout = extras["readout"]
+        extras["readout"] = dataclasses.replace(
+            shown, view=take(shown.view), encoded=take(shown.encoded)
+        )
+    shorter = dataclasses.replace(model.clip, frames=count + 1)
+    clip = dataclasses.replace(clip, frames=take(clip.frames), extras=extras)
+    return dataclasses.replace(model, clip=shorter), clip
+
+
+without_memory = functools.partial(of_stage, stage="stage1", memory=False)
 """The loss of stage 1."""
-with_memory = functools.partial(loss, memory=True)
+with_memory = functools.partial(of_stage, stage="stage2", memory=True)
 """The loss of stage 2."""
-joint = functools.partial(loss, memory=True, perceptual=True)
+joint = functools.partial(of_stage, stage="joint", memory=True, perceptual=True)
 """The loss of stage ``joint``."""
 
 

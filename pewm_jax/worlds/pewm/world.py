@@ -23,6 +23,7 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal, rgbd_signal
 from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError, register
 from pewm_jax.config.assembled import WhereObserved
+from pewm_jax.errors import require
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params, View, WorldState
@@ -211,6 +212,20 @@ class PEWM(memories.MemoryEdits, AssembledModel):
     latents at every latent frame. `warped`: its colour and depth, rendered from each frame's camera
     and encoded; holes are marked by a mask. The last two add input channels to the backbone."""
 
+    last_alone: bool = False
+    """Candidates of which only the last frame is asked for, as in planning, imagine the last frame
+    of each clip without those before it. For models that were trained on frames drawn from clips
+    (`train.joint.frames`), whose plans are several times as fast then."""
+
+    def __post_init__(self):
+        """Validate."""
+        super().__post_init__()
+        require(
+            not self.last_alone or (self.codec.temporal == 1 and not self.control.actions),
+            "model.last_alone is true, which needs cameras as control and a codec of single "
+            "frames: set it to false.",
+        )
+
     def init(self, key: Array) -> Params:
         """Return random parameters of all parts."""
         return world_model.init(self, key)
@@ -347,7 +362,8 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         """Imagine K candidates; ``views`` is the result of ``candidates.Views``.
 
         The computation is that of ``imagine`` without ``remember``, but shared parts are computed
-        once; see ``worlds.pewm.candidates``.
+        once; see ``worlds.pewm.candidates``. With ``last`` and ``last_alone``, a clip is its last
+        frame alone.
         """
         asked = jax.vmap(lambda control: control_of(self, state.frame.camera, control))(controls)
         length = self.clip.frames - 1
@@ -357,16 +373,23 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         present, shared, made = state.frame, True, []
         for number in range(clips):
             here = slice(number * length, min((number + 1) * length, count))
+            size = here.stop - here.start
+            view = None if views is None else jax.tree.map(lambda x, n=number: x[:, n], views)
+            model = self
+            if last and self.last_alone:
+                model = dataclasses.replace(self, clip=dataclasses.replace(self.clip, frames=2))
+                view = jax.tree.map(lambda x, n=size: x[:, jnp.array([0, n])], view)
+                here, size = slice(here.stop - 1, here.stop), 1
             frames = candidates.imagine_clip(
-                self,
+                model,
                 params,
                 (present, shared),
                 state.map,
-                candidates.clip_control(asked, here, length, self.control.still),
+                candidates.clip_control(asked, here, model.clip.frames - 1, self.control.still),
                 keys_KC[:, number],
-                shown=slice(here.stop - here.start - 1 if last else 0, here.stop - here.start),
+                shown=slice(size - 1 if last else 0, size),
                 memory=memory,
-                view=None if views is None else jax.tree.map(lambda x, n=number: x[:, n], views),
+                view=view,
             )
             made.append(frames)
             present, shared = jax.tree.map(lambda x: x[:, -1:], frames), False
