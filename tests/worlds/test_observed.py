@@ -256,6 +256,7 @@ def test_egowm_has_it_too(observed, history):
         observed=observed,
         history=history,
     )
+    assert model.batch_spec.poses == (observed == "warped")  # placeholders cannot be warped by
     config = Config(model=model, train=EgoWMTrainConfig())
     params, clip = random_world(model, memory=False), a_batch(config, 2)
     clip = dataclasses.replace(clip, actions_TA=np.zeros((2, 8, 3), np.float32))

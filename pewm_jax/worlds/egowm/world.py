@@ -92,8 +92,8 @@ class EgoWM(AssembledModel):
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """The clip's frames and actions; poses only where no actions steer."""
-        poses = not self.control.actions
+        """The clip's frames and actions; poses where no actions steer, and to warp by them."""
+        poses = not self.control.actions or self.observed == "warped"
         spec = super().batch_spec
         return dataclasses.replace(spec, context=False, features=None, poses=poses)
 

@@ -210,7 +210,7 @@ def test_the_presets_have_the_frame_everywhere_low_noise_and_the_body():
         assert config.model.observed == "every"
         assert not config.model.clip.depth
         noise = config.model.noise
-        assert (noise.log_mean, noise.log_std, noise.sigma_data) == (-0.4, 1.2, 1.0)
+        assert (noise.log_mean, noise.log_std, noise.sigma_data) == (-0.3, 1.3, 0.5)
         assert config.model.control.inject == "timestep"
     assert walks.model.control.actions == 3
     assert humanoid.model.control.actions == humanoid.model.control.state == 25
