@@ -1,14 +1,16 @@
-"""Export a training run for inference: averaged weights in 16 bits, settings, and a model card.
+"""Export a training run for inference: averaged weights in 16 or 8 bits, settings, a model card.
 
 ::
 
     DST/config.json           the run's settings
-        weights.safetensors   all weights of the run, floats rounded to bfloat16 or float16
+        weights.safetensors   all weights of the run, floats rounded to bfloat16 or float16; or
+                              kernels to int8 (``nn.deferred.quantize``), the rest to float16
         base.json             the checkpoint the run started from, if any
         README.md             the model card
 
-``pewm_jax.load(DST)`` returns the leaves in the stored dtype, which halves the memory; the networks
-still compute in ``model.dtype``, because every layer casts its weights to it.
+``pewm_jax.load(DST)`` returns the leaves in the stored dtype, which halves the memory, or kernels
+that are stored in 8 bits in float32; the networks still compute in ``model.dtype``, because every
+layer casts its weights to it.
 """
 
 from __future__ import annotations
@@ -34,13 +36,15 @@ from pewm_jax.eval.clips import steered_by_record
 from pewm_jax.eval.evaluate import METRICS
 from pewm_jax.io import sources, tensor_files, tree, weights
 from pewm_jax.io.store import file_hash
+from pewm_jax.nn import deferred
 from pewm_jax.report import labels
 from pewm_jax.report.labels import MASK_NAMES, METHOD_NAMES, METRIC_NAMES, heading, number
 from pewm_jax.train import runs
 from pewm_jax.types import Params
-from pewm_jax.worlds import rollouts
+from pewm_jax.worlds import quantized, rollouts
 
 CARD = "README.md"
+INT8 = "int8"
 REPORT = Path("report") / METRICS
 TRAINED_ON = "train"
 """The training split."""
@@ -90,7 +94,11 @@ def export(
         if dtype is None:
             weights.save(folder / runs.WEIGHTS, params, metadata)
         else:
-            _write(folder / runs.WEIGHTS, params, {**metadata, "dtype": dtype}, jnp.dtype(dtype))
+            leaves = tree.flatten(params)
+            if dtype == INT8:
+                leaves = _in_8_bits(leaves)
+            kept = jnp.dtype(jnp.float16 if dtype == INT8 else dtype)
+            _write(folder / runs.WEIGHTS, leaves, {**metadata, "dtype": dtype}, kept)
         configuration.save(config, folder / runs.CONFIG)
         if origin:
             shutil.copyfile(origin, folder / runs.BASE)
@@ -115,20 +123,36 @@ def narrow(leaf: Any, dtype: Any = jnp.bfloat16) -> np.ndarray:
     return rounded
 
 
-def _write(path: Path, params: Params, metadata: Mapping[str, str], dtype: Any) -> None:
-    """Write the weights leaf by leaf, without a second copy in memory."""
-    leaves = tree.flatten(params)
+def _in_8_bits(leaves: Mapping[str, Any]) -> dict[str, Any]:
+    """Return leaves with kernels in int8, and their scales; codecs and encoders stay as they are.
+
+    Scales are float32: rounded to 16 bits, those of small weights would lose their precision.
+    """
+    found: dict[str, Any] = {}
+    for name, leaf in leaves.items():
+        kernel = name.endswith("kernel") and deferred.is_matrix(name, np.shape(leaf))
+        if kernel and name.split("/", maxsplit=1)[0] not in quantized.WHOLE:
+            made = deferred.quantize(leaf, INT8, stacked=deferred.is_stacked(name))
+            found |= {name: made.values, name + weights.SCALE: made.scale}
+        else:
+            found[name] = leaf
+    return found
+
+
+def _write(path: Path, leaves: Mapping[str, Any], metadata: Mapping[str, str], dtype: Any) -> None:
+    """Write the weights leaf by leaf, without a second copy in memory; scales as they are."""
+
+    def rounds(name: str, leaf: Any) -> bool:
+        return jnp.issubdtype(leaf.dtype, jnp.floating) and not name.endswith(weights.SCALE)
+
     like = {
-        name: jax.ShapeDtypeStruct(
-            np.shape(leaf),
-            dtype if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf.dtype,
-        )
+        name: jax.ShapeDtypeStruct(np.shape(leaf), dtype if rounds(name, leaf) else leaf.dtype)
         for name, leaf in leaves.items()
     }
 
     def narrowed() -> Iterator[tuple[str, np.ndarray]]:
         for name, leaf in leaves.items():
-            yield name, narrow(leaf, dtype)
+            yield name, narrow(leaf, dtype) if rounds(name, leaf) else np.asarray(leaf)
 
     tensor_files.write(path, like, narrowed(), tensor_files.header(metadata))
 
@@ -219,7 +243,7 @@ def _what(facts: CardFacts) -> str:
         f"imagines what the agent will see, {seen}, in clips of {size}, with {memory}{made_of}."
         f"\n\n{table}\n\n"
         "Weights are the moving average of the trained parameters and the unchanged base weights "
-        f"elsewhere{', rounded to 16 bits' * bool(facts.dtype)}; they compute in "
+        f"elsewhere{_rounding(facts.dtype)}; they compute in "
         f"{config.model.dtype}. Written by "
         f"pewm_jax {facts.version}."
     )
@@ -308,6 +332,13 @@ def _training(facts: CardFacts) -> str:
         tail += f", noise {facts.config.model.facts.noise}"
     tail += f". It started from `{train.start}`." if train.start else "."
     return head + "\n".join(rows) + tail
+
+
+def _rounding(dtype: str | None) -> str:
+    """Return what the card says about the precision of the weights."""
+    if dtype is None:
+        return ""
+    return ", kernels rounded to 8 bits" if dtype == INT8 else ", rounded to 16 bits"
 
 
 def _scores(metrics: Mapping[str, Any] | None, dtype: str | None) -> str:

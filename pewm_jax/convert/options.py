@@ -214,8 +214,9 @@ class ExportInference:
     """A run's folder, made by train.py."""
     dst: Annotated[Path, tyro.conf.Positional]
     """Folder to create."""
-    dtype: Literal["bfloat16", "float16"] = "bfloat16"
-    """Precision of the weights: float16 has smaller rounding errors, bfloat16 a larger range."""
+    dtype: Literal["bfloat16", "float16", "int8"] = "bfloat16"
+    """Precision of the weights: float16 has smaller rounding errors, bfloat16 a larger range. int8
+    is for small files: kernels in 8 bits, with one scale for each output channel."""
 
 
 @dataclasses.dataclass(frozen=True)

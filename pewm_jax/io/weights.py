@@ -1,6 +1,7 @@
 """Network weights as one safetensors file with flat ``a/b/c`` keys; loading executes no code.
 
-Trees of arrays, stored by ``tensor_files``.
+Trees of arrays, stored by ``tensor_files``. A kernel may be stored in 8 bits, with its scales under
+its name and ``SCALE``; it is read as float32.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ import numpy as np
 from pewm_jax.errors import UserError
 from pewm_jax.io import pickles, tensor_files, tree
 from pewm_jax.types import Array, Params
+
+SCALE = "#scale"
+"""End of the names of the scales of kernels that are stored in 8 bits."""
 
 
 def save(
@@ -54,7 +58,7 @@ def load(path: Path, part: str = "") -> Params:
     }
     if part and not found:
         raise UserError(f"{path} contains no {part}; use weights that have it.")
-    return tree.unflatten(found)
+    return tree.unflatten(_wide(found, path))
 
 
 def lazy(path: Path) -> Params:
@@ -62,7 +66,19 @@ def lazy(path: Path) -> Params:
 
     Otherwise like ``load``, but checksums are not verified; ``verify`` does that.
     """
-    return tree.unflatten(tensor_files.mapped(path))
+    return tree.unflatten(_wide(tensor_files.mapped(path), path))
+
+
+def _wide(found: Mapping[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
+    """Multiply kernels in 8 bits by their scales."""
+    arrays = {name: array for name, array in found.items() if not name.endswith(SCALE)}
+    for name, scale in found.items():
+        if name not in arrays:
+            kernel = name.removesuffix(SCALE)
+            if kernel not in arrays:
+                raise UserError(f"{path} has scales and no kernel {kernel}; write it again.")
+            arrays[kernel] = arrays[kernel].astype(np.float32) * scale
+    return arrays
 
 
 def read_others(path: Path, of: str) -> dict[str, np.ndarray]:

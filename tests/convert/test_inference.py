@@ -93,6 +93,36 @@ def test_every_leaf_is_there_in_bfloat16_and_the_world_rolls_on(run, params, tmp
     assert np.isfinite(got.depth_THW).all()
 
 
+def test_kernels_in_8_bits_are_read_in_full_precision(run, params, tmp_path):
+    inference.export(run, tmp_path / "eight", "int8", log=lambda _: None)
+    file = tmp_path / "eight" / runs.WEIGHTS
+    small, lazy = pewm_jax.load(tmp_path / "eight")[1], weights.lazy(file)
+    have, want = tree.flatten(small), tree.flatten(params)
+    assert have.keys() == want.keys()
+    jax.tree.map(np.testing.assert_array_equal, small, lazy)
+    kernels = [name for name in want if name.endswith("kernel") and want[name].ndim > 1]
+    assert len(kernels) > 10
+    for name, leaf in have.items():
+        stacked = "/blocks/" in name
+        if name.endswith("kernel") and leaf.ndim - stacked > 1:
+            assert leaf.dtype == np.float32
+            axes = tuple(range(int(stacked), leaf.ndim - 1))
+            largest = np.abs(want[name]).max(axes, keepdims=True)
+            assert (np.abs(leaf - want[name]) <= largest / 254 * 1.001).all()
+        else:
+            np.testing.assert_array_equal(leaf, want[name].astype(np.float16), name)
+    assert file.stat().st_size < (run / runs.WEIGHTS).stat().st_size * 0.35
+    assert "kernels rounded to 8 bits" in (tmp_path / "eight" / "README.md").read_text()
+    branch = weights.load(file, "backbone")
+    jax.tree.map(np.testing.assert_array_equal, branch, small["backbone"])
+
+
+def test_scales_without_a_kernel_are_refused(tmp_path):
+    weights.save(tmp_path / "odd.safetensors", {"a": {"kernel#scale": np.ones(2, np.float32)}})
+    with pytest.raises(UserError, match="no kernel a/kernel"):
+        weights.load(tmp_path / "odd.safetensors")
+
+
 def test_the_card_tells_base_licence_data_and_scores(run, tmp_path):
     card = export(run, tmp_path / "plain")
     assert "have no report" in card
