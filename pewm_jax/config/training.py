@@ -315,19 +315,24 @@ class TrainSettings:
 
     def require_fit(self, model: Any) -> None:
         """Refuse settings that do not go together with the world's."""
-        stages = {name: x for name, x in vars(self).items() if isinstance(x, StageConfig)}
-        drawing = [name for name, settings in stages.items() if settings.frames]
-        for name in drawing:
+        for name, stage in vars(self).items():
+            if not isinstance(stage, StageConfig) or not stage.frames:
+                continue
+            setting = f"train.{name}.frames is {stage.frames}"
             require(
                 name in self.DRAWS,
-                f"train.{name}.frames is {stages[name].frames}, but this stage takes whole clips: "
-                "set it to 0.",
+                f"{setting}, but this stage takes whole clips: set it to 0.",
             )
-        require(
-            not drawing or (model.codec.temporal == 1 and not model.control.actions),
-            f"train.{''.join(drawing[:1])}.frames draws single frames of a clip, which needs "
-            "cameras as control and a codec of single frames: set it to 0.",
-        )
+            require(
+                model.codec.temporal == 1 and not model.control.actions,
+                f"{setting}: to draw single frames of a clip needs cameras as control and a codec "
+                "of single frames; set it to 0.",
+            )
+            require(
+                stage.frames < model.clip.frames,
+                f"{setting}, and a clip of {model.clip.frames} frames imagines "
+                f"{model.clip.frames - 1}: use fewer, or 0 for all of them.",
+            )
 
 
 @dataclasses.dataclass(frozen=True)

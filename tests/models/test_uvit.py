@@ -236,6 +236,8 @@ def test_frames_are_not_drawn_where_a_stage_or_a_codec_cannot():
         tiny_config(codec=MODEL.codec, train=TrainConfig(gate=few))
     with pytest.raises(ConfigError, match="codec of single frames"):
         tiny_config(train=TrainConfig(joint=few))
+    with pytest.raises(ConfigError, match=r"frames is 9, and a clip of 9 frames imagines 8"):
+        tiny_config(codec=MODEL.codec, train=TrainConfig(joint=StageConfig(frames=9)))
     with pytest.raises(ConfigError, match="share from 0 to 1"):
         StageConfig(frames=2, whole=1.5)
 

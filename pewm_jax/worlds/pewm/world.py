@@ -215,7 +215,7 @@ class PEWM(memories.MemoryEdits, AssembledModel):
     last_alone: bool = False
     """Candidates of which only the last frame is asked for, as in planning, imagine the last frame
     of each clip without those before it. For models that were trained on frames drawn from clips
-    (`train.joint.frames`), whose plans are several times as fast then."""
+    (`train.joint.frames`)."""
 
     def __post_init__(self):
         """Validate."""
