@@ -71,7 +71,7 @@ class Launch(Join):
     """Of a plan for TPUs with `--compiler target`: number of equal slices that make up the devices.
     Slices are joined by the data-centre network, along the mesh axis `data`."""
     chip: str = "h200"
-    """Of a plan: a100, h100, h200, b200, v4, v5e, v5p, v6e or tpu7x."""
+    """Of a plan: rtx4090, a100, h100, h200, b200, v4, v5e, v5p, v6e or tpu7x."""
     compiler: str = "cpu"
     """Of a plan: `target` compiles the step with the chip's own compiler, which needs the extra
     plan-tpu or plan-cuda; `cpu` compiles it for virtual CPU devices and estimates the chip's."""
