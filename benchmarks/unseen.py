@@ -81,11 +81,18 @@ def views(settings: Settings) -> tuple[list[View], int]:
     """Return the views that are shown, and from how many they were taken.
 
     Raises:
-        UserError: no view has as many never-seen pixels, or there is nothing to compare.
+        UserError: no view has as many never-seen pixels, there is nothing to compare or to show, or
+            the world has no memory of surfels.
     """
     if settings.seeds < 2:
         raise UserError(f"--seeds is {settings.seeds}: imagined views are compared, use 2 or more.")
+    if settings.views < 1:
+        raise UserError(f"--views is {settings.views}: show at least 1.")
     loaded = loaded_run.open_run(settings.run)
+    if not hasattr(getattr(loaded.config.model, "memory", None), "render_colours"):
+        raise UserError(
+            f"{settings.run} has no memory of surfels, which is drawn beside its views."
+        )
     data = dataclasses.replace(loaded.config.data, path=str(settings.data))
     how = dataclasses.replace(loaded.config.evaluate, split=settings.split)
     config = dataclasses.replace(loaded.config, data=data, evaluate=how)

@@ -73,7 +73,7 @@ def run(settings: Settings) -> None:
 def _require_usable(settings: Settings) -> None:
     """Raise errors before the page opens: missing model, unusable start, unwritable folder.
 
-    Weights are memory-mapped and not read.
+    Weights are memory-mapped; of them, only kernels in 8 bits are read.
     """
     from pewm_jax import config as configuration
     from pewm_jax.config import World

@@ -7,7 +7,7 @@ rule: q·k + 1 frames become k + 1 latent frames, the first of which holds q cop
 from __future__ import annotations
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -52,6 +52,16 @@ class PixelConfig(Codec):
         """Validate."""
         require_positive(self, "codec", "spatial", "temporal")
         require(self.gate >= 0, f"codec.gate is {self.gate}: use 0 (no gate) or more channels.")
+
+    def check(self, model: Any) -> None:
+        """Refuse an odd height or width with a gate, besides what every codec refuses."""
+        super().check(model)
+        clip = model.clip
+        require(
+            not self.gate or clip.height % gates.FOLD == clip.width % gates.FOLD == 0,
+            f"clip is {clip.height}×{clip.width}: codec.gate needs an even height and width; "
+            "change the clip's size, or use codec.gate 0.",
+        )
 
     def init(self, key: Array) -> Params:
         """Return random parameters of the gate, if there is one."""

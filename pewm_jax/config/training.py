@@ -117,10 +117,12 @@ class StageConfig:
     """Parts of a batch that are computed one after the other, so that activations take less memory
     (gradient accumulation). A step uses the mean of their losses and gradients."""
     frames: int = 0
-    """Frames that a step imagines of each clip, drawn at random; 0 for all of them. A step of few
-    frames is faster, and frames of one clip resemble each other."""
+    """Frames that a step imagines of each clip, drawn at random; 0 for all of them. A step is then
+    faster, and little is lost, because the frames of a clip resemble each other. Clips of drawn
+    frames are not chained (`train.chained`)."""
     whole: float = 0.0
-    """Share of the steps that imagine whole clips, where ``frames`` is set."""
+    """Share of the steps (of the micro-batches, if there are several) that imagine whole clips,
+    where ``frames`` is set. FLOPs are counted as if all did."""
     learning_rate: float = 1e-3
     """Peak learning rate of Adam."""
     warmup: int = 50
@@ -142,6 +144,11 @@ class StageConfig:
             self.frames >= 0 and 0 <= self.whole <= 1,
             f"frames is {self.frames} and whole {self.whole}: use 0 (all frames) or more, and a "
             "share from 0 to 1.",
+        )
+        require(
+            self.frames > 0 or not self.whole,
+            f"whole is {self.whole}, and frames is 0, so that all clips are whole: set frames, or "
+            "use whole 0.",
         )
         require(self.warmup >= 0, f"warmup is {self.warmup}: use 0 (none) or more steps.")
 
@@ -258,7 +265,8 @@ class TrainSettings:
     """Share of clips that start from a frame predicted by the model, as all clips but the first do
     in a rollout: the clip is run backwards in one denoising step from a random level of noise, and
     starts from the model's prediction, without gradient, of its first frame (`worlds/objective.py`
-    documents the limits). Costs a forward pass for that share."""
+    documents the limits). Costs a forward pass for that share. Clips of drawn frames
+    (`frames` of a stage) are not chained."""
     denoised_lpips: float = 0.0
     """Weight of LPIPS between denoised and true colours, of one frame of every clip; 0 leaves it
     out. Noisier clips count less. It makes few sampling steps sharp, and a step slower, so use it
@@ -325,7 +333,7 @@ class TrainSettings:
             )
             require(
                 model.codec.temporal == 1 and not model.control.actions,
-                f"{setting}: to draw single frames of a clip needs cameras as control and a codec "
+                f"{setting}: drawing single frames of a clip needs cameras as control and a codec "
                 "of single frames; set it to 0.",
             )
             require(
@@ -380,8 +388,9 @@ class TrainConfig(TrainSettings):
             require(
                 any(stage.name == "sharpen" for stage in model.stages()),
                 f"train.sharpen.steps is {self.sharpen.steps}, but this model has no gate that "
-                "mixes its memory's colours in: give it a codec with a gate (codec.kind learned, "
-                "codec.gate) and a memory of colours, or set train.sharpen.steps 0.",
+                "mixes its memory's colours in: give it a codec with a gate (codec.kind learned or "
+                "pixel, codec.gate 48), clip.depth true and a memory of colours, or set "
+                "train.sharpen.steps 0.",
             )
 
 

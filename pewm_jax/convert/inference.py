@@ -140,7 +140,7 @@ def _in_8_bits(leaves: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _write(path: Path, leaves: Mapping[str, Any], metadata: Mapping[str, str], dtype: Any) -> None:
-    """Write the weights leaf by leaf, without a second copy in memory; scales as they are."""
+    """Write the weights leaf by leaf, rounding one at a time; scales as they are."""
 
     def rounds(name: str, leaf: Any) -> bool:
         return jnp.issubdtype(leaf.dtype, jnp.floating) and not name.endswith(weights.SCALE)
@@ -338,7 +338,9 @@ def _rounding(dtype: str | None) -> str:
     """Return what the card says about the precision of the weights."""
     if dtype is None:
         return ""
-    return ", kernels rounded to 8 bits" if dtype == INT8 else ", rounded to 16 bits"
+    if dtype != INT8:
+        return ", rounded to 16 bits"
+    return ", kernels rounded to 8 bits and all else, with codecs and encoders, to 16 bits"
 
 
 def _scores(metrics: Mapping[str, Any] | None, dtype: str | None) -> str:

@@ -216,7 +216,8 @@ class ExportInference:
     """Folder to create."""
     dtype: Literal["bfloat16", "float16", "int8"] = "bfloat16"
     """Precision of the weights: float16 has smaller rounding errors, bfloat16 a larger range. int8
-    is for small files: kernels in 8 bits, with one scale for each output channel."""
+    is for small files: kernels in 8 bits, with one scale for each output channel, and those of
+    codecs and encoders in float16, as all other weights."""
 
 
 @dataclasses.dataclass(frozen=True)

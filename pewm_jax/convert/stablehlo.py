@@ -48,6 +48,7 @@ from pewm_jax.data import abstract
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.geometry import actions as action_geometry
 from pewm_jax.io import tree
+from pewm_jax.io import weights as io_weights
 from pewm_jax.memory import interface as memories
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.nn import target
@@ -295,7 +296,8 @@ def export(
             for one in exported:
                 file = entries[name]["files"][one.platforms[0]]
                 (folder / file).write_bytes(_serialize(one))
-        shutil.copyfile(run / runs.WEIGHTS, folder / runs.WEIGHTS)
+        # Not a copy: kernels may be stored in 8 bits, and the programs take them as they are read.
+        io_weights.save(folder / runs.WEIGHTS, params, io_weights.metadata(run / runs.WEIGHTS))
         signature = {
             "made_by": f"pewm_jax {__version__}, jax {jax.__version__}",
             "weights": runs.WEIGHTS,

@@ -64,7 +64,8 @@ def load(path: Path, part: str = "") -> Params:
 def lazy(path: Path) -> Params:
     """Memory-map a weights file: only the indexed part of each array is read.
 
-    Otherwise like ``load``, but checksums are not verified; ``verify`` does that.
+    Kernels in 8 bits are read and expanded to float32. Otherwise like ``load``, but checksums are
+    not verified; ``verify`` does that.
     """
     return tree.unflatten(_wide(tensor_files.mapped(path), path))
 

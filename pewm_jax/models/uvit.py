@@ -65,7 +65,7 @@ class UViTBackbone(DiTBackbone):
         return dataclasses.replace(super().places, cell_width=self.channels)
 
     def check(self, model: Any) -> None:
-        """Refuse latents that do not split into patches, and channels that do not fit."""
+        """Refuse tokens of several latent frames, or what the transformer refuses."""
         super().check(model)
         require(
             self.patch_t == 1,

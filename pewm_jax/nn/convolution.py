@@ -65,11 +65,11 @@ def _kernel_by_product(x_NHWC: Array, kernel: Array, out_NHWO: Array) -> Array:
         product = of_group(x_NHWC, out_NHWO)
     else:
         groups = (x.reshape(-1, size, *x.shape[1:]) for x in (x_NHWC, out_NHWO))
-        start = jnp.zeros((outward, side * side * inward), x_NHWC.dtype)
+        start = jnp.zeros((outward, side * side * inward), jnp.float32)
         product, _ = jax.lax.scan(
             lambda total, group: (total + of_group(*group), None), start, tuple(groups)
         )
-    return product.T.reshape(kernel.shape)
+    return product.T.reshape(kernel.shape).astype(kernel.dtype)
 
 
 def _kernel_by_convolution(x_NHWC: Array, kernel: Array, out_NHWO: Array) -> Array:

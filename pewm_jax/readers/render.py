@@ -2,13 +2,15 @@
 
 The rendered views (``view`` of a ``MemoryReadout``) are folded into the cells of the latents by
 space-to-depth without encoding. Each video token gets its pixels: colours or features, depth and a
-mask. Or, with ``picture`` `latents`, it gets the codec's latents of the views (``encoded``), 0 in
-unseen cells, and the mask. Either is added to the embedded tokens through a layer that starts at
-zero, and given to a block without attention after every block of the backbone (``RenderBlock``), by
-which a frozen backbone learns to use it. A fresh reader, or an empty view, changes nothing.
+mask. A backbone that embeds its input cell by cell also gets the pixels of each cell. With
+``picture`` `latents`, tokens get the codec's latents of the views (``encoded``), 0 in unseen cells,
+and the mask. They are added to the embedded tokens through a layer that starts at zero, and given
+to a block without attention after every block of the backbone (``RenderBlock``), by which a frozen
+backbone learns to use them. A fresh reader, or an empty view, changes nothing.
 
 Parameters, under ``render``: ``reduce`` (views of many channels), ``embed_1``, ``embed_2``,
-``added``, and the stacked ``blocks``. The reader ``both`` has these and those of the attention.
+``added``, and the stacked ``blocks``; ``cell_1`` and ``cell_2`` for backbones with cells. The
+reader ``both`` has these and those of the attention.
 """
 
 from __future__ import annotations
@@ -214,9 +216,12 @@ class RenderConfig(Reader):
         }
         params: Params = {}
         layers = _embeddings(model)
-        for place, name in enumerate(sorted(layers, key=lambda name: (name in CELLS, name))):
+        names = [*sorted(set(layers) - set(CELLS)), *(name for name in CELLS if name in layers)]
+        for place, name in enumerate(names):
+            # Layers without cells have the keys of versions that had no others.
+            number = place + len(widths) * (name in CELLS)
             example = jnp.zeros((1, widths[name]))
-            params[name] = layers[name].init(jax.random.fold_in(key, place), example)["params"]
+            params[name] = layers[name].init(jax.random.fold_in(key, number), example)["params"]
         if self.blocks:
             example = (
                 jnp.zeros((1, 1, places.width)),
@@ -224,7 +229,7 @@ class RenderConfig(Reader):
                 jnp.zeros((1, 1, self.picture_width)),
             )
             block = RenderBlock(self.mlp_ratio, TokenLayout(1, 0, 1, 1))
-            blocks_key = jax.random.fold_in(key, len(widths))
+            blocks_key = jax.random.fold_in(key, len(widths) - len(CELLS))
             params["blocks"] = init_stacked(block, blocks_key, places.count, example)
         return {"render": params}
 

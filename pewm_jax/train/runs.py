@@ -38,6 +38,7 @@ BASE = "base.json"
 
 MUTABLE_FIELDS = (
     "evaluate",
+    "model.last_alone",
     "data.features",
     "data.prepared_path",
     "data.workers",

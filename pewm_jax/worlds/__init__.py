@@ -175,7 +175,9 @@ def imagine_many(
         controls: as for ``imagine``, with a leading axis K.
         keys: (K,) randomness of each candidate; equal keys give equal noise.
         memory: see ``imagine``.
-        last: return only the last frame of each, (K, 1); a world may then leave others undecoded.
+        last: return only the last frame of each, (K, 1). A world may then leave the others
+            undecoded or, with ``model.last_alone``, not imagine them; the frame then differs from
+            that of ``last=False``.
         views: the result of ``views(…)(controls)`` for these controls, if it was computed.
 
     Returns:

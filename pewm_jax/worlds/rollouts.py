@@ -35,7 +35,8 @@ def load_finished(
         path: a run folder made by ``train.py``, with ``config.json`` and ``weights.safetensors``,
             or the name of weights that come with the library. Adapters (``worlds.lora``) are added
             to the weights that they adapt.
-        lazily: map the file into memory, so that unused weights are not read.
+        lazily: map the file into memory, so that unused weights are not read, except kernels in 8
+            bits.
         config: the run's configuration, if it is read already.
 
     Raises:

@@ -1,6 +1,7 @@
 """The benchmark of never-seen views: which views it shows, and what it prints."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import config as configs
+from pewm_jax.errors import UserError
 from pewm_jax.io import weights
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.readers.render import RenderConfig
@@ -48,7 +50,33 @@ def test_views_and_distances_of_a_tiny_run(tmp_path, monkeypatch, capsys):
             str(run), data=tmp_path / "data", clips=4, views=2, share=0.0, seeds=2, out=tmp_path
         )
     )
-    assert "2 of " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "2 of " in said
+    numbers = [float(x) for x in re.findall(r"\d\.\d{3}", said)]
+    assert len(numbers) == 3  # "nan" is no number here
+    assert numbers[0] > 0
     assert cv2.imread(str(tmp_path / "views.png")).std() > 0
+    for name in ("unseen", "record"):
+        sys.modules.pop(name, None)
+
+
+def test_views_of_other_memories_and_no_views_are_refused(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import unseen
+
+    base = tiny(tmp_path)
+    configs.save(base, tmp_path / "config.json")
+    params = jax.jit(lambda key: world_model.init(base.model, key))(jax.random.key(0))
+    weights.save(tmp_path / "weights.safetensors", params)
+    settings = unseen.Settings(str(tmp_path), data=tmp_path, out=tmp_path)
+    with pytest.raises(UserError, match="no memory of surfels"):
+        unseen.views(settings)
+    with pytest.raises(UserError, match="--views is 0"):
+        unseen.views(dataclasses.replace(settings, views=0))
+    image, other = np.zeros((4, 4, 3), np.float32), np.full((4, 4, 3), 0.5, np.float32)
+    left = np.arange(4)[None] < np.full((4, 1), 2)
+    other[:, 2:] = 0
+    assert unseen.distance(Squared(), [(image, other, left)]) == pytest.approx(0.25)
+    assert unseen.distance(Squared(), [(image, other, ~left)]) == 0
     for name in ("unseen", "record"):
         sys.modules.pop(name, None)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -6,8 +8,10 @@ from hypothesis import strategies as st
 
 from pewm_jax.codecs import rgbd, signals
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ClipConfig
-from tests.helpers import TINY
+from pewm_jax.config import ClipConfig, ConfigError
+from pewm_jax.encoders.simple import PatchColoursConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from tests.helpers import TINY, tiny_config
 from tests.properties import examples
 
 encode = jax.jit(PixelConfig.encode, static_argnums=0)
@@ -71,3 +75,14 @@ def test_rgbd_is_encoded_separately_and_concatenated():
     rgb_back, depth_back = rgbd.decode_rgbd(TINY, {}, latents)
     np.testing.assert_allclose(rgb_back, rgb, atol=1e-6)
     np.testing.assert_allclose(depth_back, depth, rtol=1e-4)
+
+
+def test_a_gate_needs_an_even_height_and_width():
+    odd = {
+        "clip": ClipConfig(frames=5, height=15, width=21),
+        "memory": SurfelConfig(encoder=PatchColoursConfig(patch=3)),
+        "backbone": dataclasses.replace(TINY.backbone, patch=1),
+    }
+    tiny_config(codec=PixelConfig(spatial=3), **odd)
+    with pytest.raises(ConfigError, match=r"clip is 15×21: codec\.gate needs an even height"):
+        tiny_config(codec=PixelConfig(spatial=3, gate=8), **odd)

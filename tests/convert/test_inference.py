@@ -112,7 +112,9 @@ def test_kernels_in_8_bits_are_read_in_full_precision(run, params, tmp_path):
         else:
             np.testing.assert_array_equal(leaf, want[name].astype(np.float16), name)
     assert file.stat().st_size < (run / runs.WEIGHTS).stat().st_size * 0.35
-    assert "kernels rounded to 8 bits" in (tmp_path / "eight" / "README.md").read_text()
+    assert (
+        "kernels rounded to 8 bits and all else" in (tmp_path / "eight" / "README.md").read_text()
+    )
     branch = weights.load(file, "backbone")
     jax.tree.map(np.testing.assert_array_equal, branch, small["backbone"])
 

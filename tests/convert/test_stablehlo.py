@@ -14,7 +14,7 @@ import pewm_jax
 from pewm_jax import config as configuration
 from pewm_jax import worlds
 from pewm_jax.config import ClipConfig, UserError
-from pewm_jax.convert import stablehlo
+from pewm_jax.convert import inference, stablehlo
 from pewm_jax.convert import stablehlo as stablehlo_programs
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.io import tree
@@ -124,6 +124,18 @@ def test_a_denoise_step_is_checked_in_a_fresh_process(run, params, tmp_path):
     (tmp_path / "step" / "denoise.jaxexport").write_bytes(b"nothing")
     with pytest.raises(UserError, match="do not run in a fresh process"):
         stablehlo.verify(tmp_path / "step", {"denoise": program}, params, 1e-3)
+
+
+@pytest.mark.slow
+@serialises
+def test_weights_in_8_bits_are_exported_as_they_are_read(run, tmp_path):
+    inference.export(run, tmp_path / "eight", "int8", log=lambda _: None)
+    said = []
+    dst = tmp_path / "step"
+    stablehlo.export(
+        tmp_path / "eight", dst, what="denoise", platforms=["cpu"], log=said.append
+    )  # compares in a fresh process
+    assert any("largest difference" in line for line in said)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pewm_jax import worlds
+from pewm_jax import presets, worlds
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import ConfigError, StageConfig, TrainConfig
 from pewm_jax.diffusion.edm import EDMConfig
@@ -240,6 +240,12 @@ def test_frames_are_not_drawn_where_a_stage_or_a_codec_cannot():
         tiny_config(codec=MODEL.codec, train=TrainConfig(joint=StageConfig(frames=9)))
     with pytest.raises(ConfigError, match="share from 0 to 1"):
         StageConfig(frames=2, whole=1.5)
+    with pytest.raises(ConfigError, match=r"whole is 0\.25, and frames is 0"):
+        StageConfig(whole=0.25)
+    persist = presets.load("persist_tiny")
+    train = dataclasses.replace(persist.train, renderer=StageConfig(frames=2))
+    with pytest.raises(ConfigError, match=r"train\.renderer\.frames is 2.*whole clips"):
+        dataclasses.replace(persist, train=train)
 
 
 @pytest.mark.parametrize("count", properties.first([11, 8, 3], 1))

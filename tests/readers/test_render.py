@@ -12,8 +12,11 @@ from pewm_jax.memory import interface as memories
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.memory.voxel_map import VoxelConfig
+from pewm_jax.nn import modules
+from pewm_jax.nn.tokens import TokenLayout
 from pewm_jax.readers import render as render_reader
 from pewm_jax.readers.attention import AttentionConfig
+from pewm_jax.readers.geometry import init_stacked
 from pewm_jax.readers.render import BothConfig, RenderConfig
 from pewm_jax.types import Clip, Control, Frames, MapTokens, MemoryReadout, View
 from pewm_jax.worlds import objective, world_model
@@ -214,3 +217,26 @@ def test_without_a_memory_there_is_nothing_to_see_but_a_reader_to_train(kind):
     params = random_world(model)
     base = predict(model, {"backbone": params["backbone"]}, None)
     assert np.abs(predict(model, params, readout) - base).max() > 1e-3
+
+
+@pytest.mark.parametrize("cells", [0, 12])
+def test_initial_weights_do_not_depend_on_whether_cells_are_embedded(cells, monkeypatch):
+    """Weights drawn from a seed are those of earlier versions, which had no layers of cells."""
+    model, key = model_of("render"), jax.random.key(0)
+    places = dataclasses.replace(model.backbone.places, cell_width=cells)
+    monkeypatch.setattr(type(model.backbone), "places", places)
+    made = model.memory.reader.init(model, key)["render"]
+    assert ("cell_1" in made) == (cells > 0)
+    monkeypatch.undo()
+    before = model.memory.reader.init(model, key)["render"]
+    shared = {name: made[name] for name in before}
+    jax.tree.map(np.testing.assert_array_equal, shared, before)
+    channels = render_reader.token_channels(model)
+    layer = modules.dense(16, jnp.float32, "embed_1")
+    drawn = layer.init(jax.random.fold_in(key, 1), jnp.zeros((1, channels)))["params"]
+    np.testing.assert_array_equal(made["embed_1"]["kernel"], drawn["kernel"])
+    block = render_reader.RenderBlock(2, TokenLayout(1, 0, 1, 1))
+    shapes = (1, 1, places.width), (1, places.time), (1, 1, 16)
+    example = tuple(jnp.zeros(shape) for shape in shapes)
+    blocks = init_stacked(block, jax.random.fold_in(key, 4), places.count, example)
+    jax.tree.map(np.testing.assert_array_equal, made["blocks"], blocks)

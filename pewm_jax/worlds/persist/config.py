@@ -87,6 +87,7 @@ class PersistTrainConfig(TrainSettings):
 
     def require_fit(self, model: Any) -> None:
         """Refuse classes through a decoder that cannot decode a latent alone."""
+        super().require_fit(model)
         vae = model.backbone.voxel_vae
         seen = (vae.kernel, vae.middle_kernel, len(vae.widths))
         require(

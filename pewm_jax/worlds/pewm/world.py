@@ -45,8 +45,8 @@ def require_gate(model: AssembledModel) -> None:
     if not memories.gated(model):
         raise UserError(
             "train.gate.steps is above 0, but this model has no gate that mixes its memory's "
-            "colours in: give it a codec with a gate (codec.kind learned, codec.gate) and a memory "
-            "of colours, or set train.gate.steps 0."
+            "colours in: give it a codec with a gate (codec.kind learned or pixel, codec.gate 48), "
+            "clip.depth true and a memory of colours, or set train.gate.steps 0."
         )
 
 
