@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pewm_jax import config as configuration
 from pewm_jax import presets, worlds
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import ConfigError, StageConfig, TrainConfig
@@ -17,6 +18,7 @@ from pewm_jax.models.interface import Conditioning, Readers
 from pewm_jax.models.uvit import UViTBackbone
 from pewm_jax.readers.attention import AttentionConfig
 from pewm_jax.readers.render import RenderConfig
+from pewm_jax.train import runs
 from pewm_jax.types import Clip
 from pewm_jax.worlds import objective
 from tests import properties
@@ -278,3 +280,10 @@ def test_the_last_frame_of_candidates_can_be_imagined_alone(count):
 def test_frames_are_imagined_alone_only_with_cameras_and_codecs_of_single_frames():
     with pytest.raises(ConfigError, match="codec of single frames"):
         dataclasses.replace(TINY, last_alone=True)
+
+
+def test_last_alone_may_change_when_a_run_is_resumed():
+    config = tiny_config(codec=MODEL.codec)
+    alone = config.with_model(last_alone=True)
+    assert configuration.to_dict(alone) != configuration.to_dict(config)
+    assert runs.identity(alone) == runs.identity(config)
