@@ -1,0 +1,69 @@
+"""A U-ViT on pixels with the memory of `small`, to imagine rooms never seen; not shipped yet."""
+
+import dataclasses
+
+from pewm_jax.codecs.pixel import PixelConfig
+from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig, TrainConfig
+from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.models.uvit import UViTBackbone
+from pewm_jax.readers.render import RenderConfig
+from pewm_jax.worlds.pewm.world import PEWM
+
+
+def config() -> Config:
+    """Return the settings of ``small2``.
+
+    Its data: ``pewm-jax data collect data/small2 --train 4000 --frames 72 --handheld 0.3``. The
+    observed frame is rendered from each camera, and a third of the rendered memories have errors,
+    as those of real recordings have. Batches are small and of few frames: many steps learn faster.
+    ``docs/trials.md`` has its scores: with so few steps it is behind ``small`` where a memory
+    exists. A step takes 0.4 to 0.9 s on two CPU cores. The gate is trained on clips that the model
+    imagines, with LPIPS in its loss (``pip install 'pewm-jax[metrics]'``).
+    """
+    of_frames = StageConfig(batch=4, frames=3, learning_rate=3e-3)
+    return Config(
+        model=PEWM(
+            clip=ClipConfig(height=64, width=64),
+            codec=PixelConfig(spatial=4, temporal=1, gate=48),
+            backbone=UViTBackbone(layers=6, heads=6, head_dim=32),
+            memory=SurfelConfig(
+                cell_m=(0.03, 0.03, 0.03),
+                capacity=98304,
+                footprint=5,
+                reader=RenderConfig(picture_width=192, blocks=False),
+            ),
+            noise=EDMConfig(
+                sigma_data=0.5,
+                log_mean=-0.3,
+                log_std=1.3,
+                sigma_min=0.03,
+                sigma_max=20.0,
+                sample_steps=6,
+            ),
+            observed="warped",
+        ),
+        data=DataConfig(
+            path="data/small2",
+            context=20,
+            stride_max=2,
+            prepared=3072,
+            prepared_path="data/small2_prepared",
+            refresh=3,
+        ),
+        train=TrainConfig(
+            run="runs/small2",
+            optimizer="muon",
+            stage1=dataclasses.replace(of_frames, steps=800, warmup=100),
+            stage2=dataclasses.replace(of_frames, steps=200, warmup=50),
+            joint=dataclasses.replace(of_frames, steps=4600, whole=0.15, warmup=100),
+            gate=StageConfig(steps=400, batch=4, learning_rate=1e-3, warmup=50),
+            gate_lpips=2.0,
+            hidden=0.15,
+            chained=0.15,
+            memory_errors=0.3,
+            ema=0.999,
+            preview_every=0,
+        ),
+        evaluate=EvalConfig(clips=48),
+    )
