@@ -3,10 +3,9 @@
 import dataclasses
 
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ClipConfig, Config, DataConfig, EvalConfig, StageConfig, TrainConfig
-from pewm_jax.diffusion.edm import EDMConfig
-from pewm_jax.memory.surfels import SurfelConfig
+from pewm_jax.config import Config, DataConfig, EvalConfig, StageConfig, TrainConfig
 from pewm_jax.models.uvit import UViTBackbone
+from pewm_jax.presets import demo, egowm
 from pewm_jax.readers.render import RenderConfig
 from pewm_jax.worlds.pewm.world import PEWM
 
@@ -15,32 +14,22 @@ def config() -> Config:
     """Return the settings of ``small2``.
 
     Its data: ``pewm-jax data collect data/small2 --train 4000 --frames 72 --handheld 0.3``. The
-    observed frame is rendered from each camera, and a third of the rendered memories have errors,
+    observed frame is rendered from each camera, and 30 % of the rendered memories have errors,
     as those of real recordings have. Batches are small and of few frames: many steps learn faster.
     ``docs/trials.md`` has its scores: with so few steps it is behind ``small`` where a memory
     exists. A step takes 0.4 to 0.9 s on two CPU cores. The gate is trained on clips that the model
     imagines, with LPIPS in its loss (``pip install 'pewm-jax[metrics]'``).
     """
+    base = demo.config().model
+    reader = RenderConfig(picture_width=192, blocks=False)
     of_frames = StageConfig(batch=4, frames=3, learning_rate=3e-3)
     return Config(
         model=PEWM(
-            clip=ClipConfig(height=64, width=64),
+            clip=base.clip,
             codec=PixelConfig(spatial=4, temporal=1, gate=48),
             backbone=UViTBackbone(layers=6, heads=6, head_dim=32),
-            memory=SurfelConfig(
-                cell_m=(0.03, 0.03, 0.03),
-                capacity=98304,
-                footprint=5,
-                reader=RenderConfig(picture_width=192, blocks=False),
-            ),
-            noise=EDMConfig(
-                sigma_data=0.5,
-                log_mean=-0.3,
-                log_std=1.3,
-                sigma_min=0.03,
-                sigma_max=20.0,
-                sample_steps=6,
-            ),
+            memory=dataclasses.replace(base.memory, reader=reader),
+            noise=dataclasses.replace(egowm.NOISE, sample_steps=6),
             observed="warped",
         ),
         data=DataConfig(

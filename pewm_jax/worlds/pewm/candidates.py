@@ -1,11 +1,10 @@
 """Many candidates from one state: shared parts are computed once, and only requested frames.
 
 Unless ``model.last_alone`` is set, a candidate imagines the same as ``imagine`` without
-remembering. The present frame is encoded once.
-The rendered memory may be given (``Views``); otherwise it is rendered, on a CPU, once per distinct
-camera (equal beginnings lead to equal cameras), and not in both sides of a branch as under
-``jax.vmap``. If only the last frame is requested, only that is decoded, where the codec works frame
-by frame.
+remembering. The present frame is encoded once. The rendered memory may be given (``Views``);
+otherwise it is rendered, on a CPU, once per distinct camera (equal beginnings lead to equal
+cameras), and not in both sides of a branch as under ``jax.vmap``. If only the last frame is
+requested, only that is decoded, where the codec works frame by frame.
 
 ``Views`` caches renderings. Discrete actions reach the same places by many ways, and the candidates
 of a search become more alike the longer it lasts. Cameras count as equal up to a millionth of a
