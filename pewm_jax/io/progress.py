@@ -13,8 +13,27 @@ EVERY_S = 10.0
 """Seconds between lines if standard output is not a terminal."""
 
 
+def duration(seconds: float) -> str:
+    """Format a duration, such as ``85 ms``, ``12.3 s``, ``4 min 05 s``, ``2 h 10 min``."""
+    if seconds < 1:
+        return f"{seconds * 1000:.0f} ms"
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def pace(rate: float) -> str:
+    """Format units per second, such as ``129/s``, ``2.4/s`` or, below 1, ``12.3 s each``."""
+    if rate >= 1:
+        return f"{rate:.0f}/s" if rate >= 10 else f"{rate:.1f}/s"
+    return f"{duration(1 / rate)} each" if rate > 0 else "0/s"
+
+
 class Meter:
-    """Progress meter; a context manager.
+    """Progress meter; a context manager. Units that were done before do not count for the rate.
 
     Example:
         >>> with Meter("train", total=100, unit="frames") as meter:
@@ -23,7 +42,7 @@ class Meter:
 
     def __init__(self, label: str, total: int, unit: str, stream: TextIO | None = None):
         self.label, self.total, self.unit = label, total, unit
-        self.done = 0
+        self.done = self._before = 0
         self._stream = sys.stdout if stream is None else stream
         self._start = self._last_line = time.monotonic()
         self._bar: Progress | None = None
@@ -41,30 +60,35 @@ class Meter:
             self._task = self._bar.add_task(self.label, total=self.total, unit=self.unit)
         return self
 
-    def advance(self, count: int) -> None:
-        """Add to the count of finished units."""
+    def advance(self, count: int, *, before: bool = False) -> None:
+        """Add to the count of finished units; ``before`` if an earlier process finished them."""
         self.done += count
+        self._before += count if before else 0
         now = time.monotonic()
-        rate = self.done / max(now - self._start, 1e-6)
+        rate = self._rate(now)
         if self._bar is not None:
-            self._bar.update(self._task, advance=count, unit=f"{self.unit}, {rate:.0f}/s")
+            self._bar.update(self._task, advance=count, unit=f"{self.unit}, {pace(rate)}")
         elif now - self._last_line >= EVERY_S:
             self._last_line = now
             remaining = (self.total - self.done) / max(rate, 1e-6)
+            left = f", {pace(rate)}, {duration(remaining)} left" if rate else ""
             print(
-                f"{self.label}: {self.done}/{self.total} {self.unit}, {rate:.0f}/s, "
-                f"{remaining:.0f} s left",
+                f"{self.label}: {self.done}/{self.total} {self.unit}{left}",
                 file=self._stream,
                 flush=True,
             )
 
     def summary(self) -> str:
         """Return one line with count, time and rate."""
-        seconds = max(time.monotonic() - self._start, 1e-6)
+        now = time.monotonic()
+        found = f", {self._before} of them before" if self._before else ""
         return (
-            f"{self.label}: {self.done} {self.unit} in {seconds:.1f} s "
-            f"({self.done / seconds:.0f}/s)"
+            f"{self.label}: {self.done} {self.unit} in {duration(now - self._start)}{found} "
+            f"({pace(self._rate(now))})"
         )
+
+    def _rate(self, now: float) -> float:
+        return (self.done - self._before) / max(now - self._start, 1e-6)
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:

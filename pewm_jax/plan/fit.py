@@ -19,12 +19,12 @@ import jax
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import abstract
 from pewm_jax.io import tree
+from pewm_jax.io.progress import duration
 from pewm_jax.plan import measure, suggest, target_compiler, topology
 from pewm_jax.plan.measure import MeshSizes, StepWork
 from pewm_jax.plan.suggest import Job
 from pewm_jax.plan.target_compiler import StageReport
 from pewm_jax.train.chips import Chip
-from pewm_jax.train.log import duration
 from pewm_jax.worlds.stages import Stage
 
 REMAT = "remat"

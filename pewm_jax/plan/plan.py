@@ -25,6 +25,7 @@ import jax
 from pewm_jax import __version__
 from pewm_jax.config import Config, Launch, UserError
 from pewm_jax.io import atomic, tree
+from pewm_jax.io.progress import duration
 from pewm_jax.plan import fit, inference, measure, suggest, target_compiler, topology
 from pewm_jax.plan.measure import Compiled, MeshSizes, virtual
 from pewm_jax.plan.program import COLLECTIVES
@@ -32,7 +33,6 @@ from pewm_jax.plan.suggest import Arrangement
 from pewm_jax.plan.target_compiler import StageReport
 from pewm_jax.train import chips, runs, sharding
 from pewm_jax.train.chips import Chip
-from pewm_jax.train.log import duration
 from pewm_jax.worlds.stages import Stage
 
 MOST_ARRAYS = 1000

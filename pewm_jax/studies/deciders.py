@@ -50,6 +50,8 @@ NONE = "none"
 REPROJECTION = ReprojectSettings(footprint=2)
 """Settings of ``reproject``: those that ``pewm-jax evaluate small`` chose on the validation split
 of its data."""
+AT_ONCE = 16
+"""Reprojections are computed for multiples of so many candidates."""
 Policy: TypeAlias = Callable[[TaskInput, int], np.ndarray]
 """``policy(task, count) -> (count, N)`` discrete actions: proposals, with the policy's own choice
 first."""
@@ -133,7 +135,10 @@ class Reprojection:
     def __call__(self, actions_KN: Any) -> Frames:
         """Return the frame after each candidate's last action, (K, 1) frames."""
         moves = continuous(self.motion, np.asarray(actions_KN))
-        return jax.device_get(_reproject(self.settings, self.observed, moves))
+        count = len(moves)  # it varies, and every other one would be compiled
+        filled = np.resize(moves, (-(-count // AT_ONCE) * AT_ONCE, *moves.shape[1:]))
+        made = _reproject(self.settings, self.observed, filled)
+        return jax.tree.map(lambda x: x[:count], jax.device_get(made))
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -106,8 +106,10 @@ def run(
             make = functools.partial(
                 practice_piece.make, world, begun, study, house, how, seed, out / name
             )
-            made[how].append(cache.compute(f"{name}/scores", make))
-            meter.advance(1)
+            found = cache.get(f"{name}/scores")
+            before = found is not None
+            made[how].append(found if before else cache.put(f"{name}/scores", make()))
+            meter.advance(1, before=before)
     log(meter.summary())
     results = summary(made) | {
         "about": about

@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from pewm_jax.config import Config
+from pewm_jax.io.progress import duration
 from pewm_jax.train import processes
 from pewm_jax.train.sinks import SINKS, Sink
 from pewm_jax.worlds.stages import Stage
@@ -147,18 +148,6 @@ def _counts(metrics: Mapping[str, float]) -> str:
     return "".join(
         f"{name} {metrics[key]:.0f} · " for key, name in names.items() if metrics.get(key)
     )
-
-
-def duration(seconds: float) -> str:
-    """Format a duration, such as ``85 ms``, ``12.3 s``, ``4 min 05 s``, ``2 h 10 min``."""
-    if seconds < 1:
-        return f"{seconds * 1000:.0f} ms"
-    if seconds < 60:
-        return f"{seconds:.1f} s"
-    minutes, rest = divmod(round(seconds), 60)
-    if minutes < 60:
-        return f"{minutes} min {rest:02d} s"
-    return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 FOLDER = "profile"

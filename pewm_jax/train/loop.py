@@ -22,6 +22,7 @@ from jax.sharding import Mesh
 from pewm_jax.config import Config, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.data.loader import BadRecords
+from pewm_jax.io.progress import duration
 from pewm_jax.memory import feature_cache
 from pewm_jax.train import flops, loading, processes, runs, sharding, sinks
 from pewm_jax.train.checkpoint import Checkpoints
@@ -33,7 +34,7 @@ from pewm_jax.train.feed import (
     start_digest,
     uses_prepared,
 )
-from pewm_jax.train.log import LiveView, MetricsLog, Pace, Profile, duration
+from pewm_jax.train.log import LiveView, MetricsLog, Pace, Profile
 from pewm_jax.train.signals import Stop
 from pewm_jax.train.step import (
     Metrics,

@@ -14,7 +14,6 @@ import pytest
 
 from pewm_jax.cli import main as program
 from pewm_jax.data.validate import ValidationResult
-from pewm_jax.io.progress import Meter
 from pewm_jax.presets.demo import config as demo
 from tests.data.two_rooms import split
 
@@ -147,17 +146,6 @@ def test_an_interruption_says_so(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr("pewm_jax.data.collect.collect", interrupted)
     assert program.main(["data", "collect", str(tmp_path / "x")]) == 130
     assert "run the same command again to resume" in capsys.readouterr().err
-
-
-def test_progress_off_the_terminal_is_a_line_now_and_then(capsys, monkeypatch):
-    clock = iter([0.0, 4.0, 11.0, 12.0, 20.0])
-    monkeypatch.setattr("pewm_jax.io.progress.time.monotonic", lambda: next(clock))
-    with Meter("work", 100, "frames") as meter:
-        meter.advance(10)
-        meter.advance(12)
-        meter.advance(1)
-    assert capsys.readouterr().out == "work: 22/100 frames, 2/s, 39 s left\n"
-    assert meter.summary() == "work: 23 frames in 20.0 s (1/s)"
 
 
 def test_the_format_is_the_first_argument_or_a_flag(monkeypatch, capsys):

@@ -219,6 +219,17 @@ class _Spied(deciders.Predictors):
         return super().observe(mind, state, frames)
 
 
+def test_any_number_of_candidates_is_reprojected_by_one_program():
+    mind = deciders.Predictors(presets.load("tiny"), {}).rollout("reproject", task(0))
+    actions = np.random.default_rng(0).integers(0, 3, (7, 6))
+    mind(actions)
+    known = deciders._reproject._cache_size()
+    for count in (1, 3, 7):
+        one_by_one = [mind(actions[k : k + 1]).rgb_THWC[0] for k in range(count)]
+        np.testing.assert_array_equal(mind(actions[:count]).rgb_THWC, np.stack(one_by_one))
+    assert deciders._reproject._cache_size() == known
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
 def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):

@@ -162,21 +162,6 @@ def test_on_a_terminal_there_is_a_bar():
     assert "a picture" in stream.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0.0, "0 ms"),
-        (0.0852, "85 ms"),
-        (12.34, "12.3 s"),
-        (245, "4 min 05 s"),
-        (3599.7, "1 h 00 min"),
-        (7800, "2 h 10 min"),
-    ],
-)
-def test_durations(seconds, text):
-    assert log.duration(seconds) == text
-
-
 def test_pauses_do_not_count_as_steps():
     pace = log.Pace(0.0)
     assert pace.tick(2.0) == 2.0
