@@ -157,12 +157,11 @@ def run(
                         _decide_and_score, name, goal, predictors, policy, cost, study
                     )
                     piece = f"{_folder(name, study, times, none)}/{number:04d}"
-                    found = cache.get(piece)
-                    before = found is not None
-                    found = found if before else cache.put(piece, decide())
+                    known = cache.get(piece)
+                    found = cache.put(piece, decide()) if known is None else known
                     scores_here = _scored(goal, np.array(found["actions"]))
                     made[name].append(found | {"scores": scores_here})
-                    meter.advance(1, before=before)
+                    meter.advance(1, before=known is not None)
     log(meter.summary())
     made = next(iter(by_distance.values()))
     results = summary(made) | {
