@@ -79,12 +79,13 @@ class Meter:
             )
 
     def summary(self) -> str:
-        """Return one line with count, time and rate."""
+        """Return one line with count, time and, unless all was done before, the rate."""
         now = time.monotonic()
+        rate = self._rate(now)
         found = f", {self._before} of them before" if self._before else ""
+        speed = f" ({pace(rate)})" if rate else ""
         return (
-            f"{self.label}: {self.done} {self.unit} in {duration(now - self._start)}{found} "
-            f"({pace(self._rate(now))})"
+            f"{self.label}: {self.done} {self.unit} in {duration(now - self._start)}{found}{speed}"
         )
 
     def _rate(self, now: float) -> float:

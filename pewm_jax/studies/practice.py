@@ -106,10 +106,9 @@ def run(
             make = functools.partial(
                 practice_piece.make, world, begun, study, house, how, seed, out / name
             )
-            found = cache.get(f"{name}/scores")
-            before = found is not None
-            made[how].append(found if before else cache.put(f"{name}/scores", make()))
-            meter.advance(1, before=before)
+            known = cache.get(f"{name}/scores")
+            made[how].append(cache.put(f"{name}/scores", make()) if known is None else known)
+            meter.advance(1, before=known is not None)
     log(meter.summary())
     results = summary(made) | {
         "about": about

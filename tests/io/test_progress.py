@@ -52,3 +52,10 @@ def test_what_was_done_before_does_not_count_for_the_rate(capsys, monkeypatch):
     out = "work: 90/100 tasks\nwork: 91/100 tasks, 20.0 s each, 3 min 00 s left\n"
     assert capsys.readouterr().out == out
     assert meter.summary() == "work: 91 tasks in 20.0 s, 90 of them before (20.0 s each)"
+
+
+def test_a_summary_of_nothing_new_has_no_rate(monkeypatch):
+    at(monkeypatch, 0.0, 1.0, 2.0)
+    with Meter("work", 5, "tasks") as meter:
+        meter.advance(5, before=True)
+    assert meter.summary() == "work: 5 tasks in 2.0 s, 5 of them before"

@@ -230,7 +230,6 @@ def test_any_number_of_candidates_is_reprojected_by_one_program():
     assert deciders._reproject._cache_size() == known
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
 def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
     config = presets.load("tiny")  # 4 actions at once
@@ -262,13 +261,32 @@ def test_a_closed_loop_with_the_truth_and_a_true_cost_comes_to_the_goal():
     assert after < 0.3 < before
 
 
-@pytest.mark.slow
-def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
-    folder, _ = made
+def without_memory():
+    """Return the settings and parameters of a model that was trained in stage 1 alone."""
     config = presets.load("tiny")
     stage2 = dataclasses.replace(config.train.stage2, steps=0)
     config = dataclasses.replace(config, train=dataclasses.replace(config.train, stage2=stage2))
-    params = world_model.init(config.model, jax.random.key(1), memory=False)
+    return config, world_model.init(config.model, jax.random.key(1), memory=False)
+
+
+def test_a_model_trained_without_memory_decides_by_its_own_weights():
+    config = presets.load("tiny")
+    none, goal, actions = without_memory(), task(0, actions=4), np.array([[1, 0, 1, 2]])
+    predictors = deciders.Predictors(config, random_world(config, scale=0.3), none=none)
+    assert predictors.names == ("empty", "none", "reproject", "memory", "truth")
+    assert {"rank2-none", "mpc-none", "loop-none"} <= set(
+        deciders.method_names((2,), predictors.names)
+    )
+    alone = deciders.Predictors(*none)
+    seen = predictors.rollout("none", goal)(actions).rgb_THWC
+    np.testing.assert_array_equal(seen, alone.rollout("empty", goal)(actions).rgb_THWC)
+    assert not np.array_equal(seen, predictors.rollout("empty", goal)(actions).rgb_THWC)
+
+
+@pytest.mark.slow
+def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
+    folder, _ = made
+    config, params = without_memory()
     weights.save(tmp_path / "none" / "weights.safetensors", params)
     configuration.save(config, tmp_path / "none" / "config.json")
     errand = dataclasses.replace(
