@@ -121,9 +121,9 @@ class Table2Settings:
 
 def table2(settings: Table2Settings) -> None:
     """Write the table and print its path."""
-    for name in ("houses", "videos"):
-        if getattr(settings, name) < (name != "videos"):
-            raise ConfigError(f"--{name} is {getattr(settings, name)}: give at least 1.")
+    for name, least in (("houses", 1), ("videos", 0)):
+        if (value := getattr(settings, name)) < least:
+            raise ConfigError(f"--{name} is {value}: give at least {least}.")
     if min(settings.tasks, default=0) < 1 or len(settings.tasks) not in (
         1,
         len(settings.multiples),

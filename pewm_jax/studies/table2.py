@@ -149,7 +149,7 @@ def run(
                 goal: Goal | None = None
                 for name in methods:
                     if name == "policy" and times > 1:
-                        meter.advance(1)
+                        meter.advance(1, before=True)  # its row is of the first distance alone
                         continue
                     far = times * study.plan.actions
                     goal = goal or goal_of(config, number, study.houses, far)

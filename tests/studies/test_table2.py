@@ -190,6 +190,7 @@ def test_ranking_takes_the_best_proposal():
         (["--proposals", "0"], "--proposals needs distinct numbers of 1 or more"),
         (["--proposals", "8", "8"], "--proposals needs distinct numbers of 1 or more"),
         (["--elites", "99"], "plan.elites is 99"),
+        (["--videos", "-1"], "--videos is -1: give at least 0"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_a_sentence(tmp_path, argv, words):
