@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -123,6 +123,38 @@ def loss(
         If the denoiser works without depth (``clip.depth``), only colour counts. Known latent
         frames of the backbone (``Conditioning.known_Bt``) do not count.
     """
+    share = {"memory": memory, "history": history, "blind": blind}
+    found = denoise(model, train, params, clip, key, **share, perceptual=perceptual)
+    return with_lpips(model, train, params, *found)
+
+
+class Denoised(NamedTuple):
+    """One denoised frame of each clip of a batch.
+
+    Attributes:
+        colours_B1hwC: the latents of its colours.
+        truth_BHWC: its true colours in [−1, 1].
+        share_B: the share of the signal in the variance of the clip's noisy latents.
+    """
+
+    colours_B1hwC: Array
+    truth_BHWC: Array
+    share_B: Array
+
+
+def denoise(
+    model: AssembledModel,
+    train: TrainSettings,
+    params: Params,
+    clip: Clip,
+    key: Array,
+    *,
+    memory: bool,
+    history: int = 1,
+    blind: float = 0.0,
+    perceptual: bool = False,
+) -> tuple[Array, dict[str, Array], Denoised | None]:
+    """Return ``loss`` without LPIPS, its parts, and what LPIPS needs if the loss has it."""
     frames = as_signal(clip.frames)
     x0 = clip.extras.get("latents_thwC")
     if x0 is None:
@@ -163,10 +195,23 @@ def loss(
     if model.clip.depth:
         total = (rgb * split + depth * (channels - split)) / channels
     if not (perceptual and train.denoised_lpips):
-        return total, measures
+        return total, measures, None
     made = model.noise.to_x0(prediction, x_t, times)
-    frame_key, net = jax.random.fold_in(key, 8), train.denoised_lpips_net
-    distance = denoised_distance(model, net, params, clip, made, times, frame_key)
+    return total, measures, one_frame(model, clip, made, times, jax.random.fold_in(key, 8))
+
+
+def with_lpips(
+    model: AssembledModel,
+    train: TrainSettings,
+    params: Params,
+    total: Array,
+    measures: dict[str, Array],
+    denoised: Denoised | None,
+) -> tuple[Array, dict[str, Array]]:
+    """Add ``train.denoised_lpips`` times the distance of denoised frames, if any, to a loss."""
+    if denoised is None:
+        return total, measures
+    distance = denoised_distance(model, train.denoised_lpips_net, params, denoised)
     return total + train.denoised_lpips * distance, measures | {"lpips": distance}
 
 
@@ -277,22 +322,27 @@ def of_stage(
 ) -> tuple[Array, dict[str, Array]]:
     """Return ``loss`` of the frames that a step of this stage imagines (``StageConfig.frames``).
 
-    Clips of drawn frames are not chained.
+    Clips of drawn frames are not chained. LPIPS is outside the choice between whole clips and drawn
+    frames: inside, XLA's CPU backend took a second longer for it (`small2`, two cores).
     """
     settings, length = getattr(train, stage), model.clip.frames - 1
-    of_clips = functools.partial(loss, memory=memory, perceptual=perceptual)
-    if not 0 < settings.frames < length:
-        return of_clips(model, train, params, clip, key)
+    of_some = functools.partial(denoise, memory=memory, perceptual=perceptual)
 
-    def of_drawn() -> tuple[Array, dict[str, Array]]:
+    def of_clips() -> tuple[Array, dict[str, Array], Denoised | None]:
+        return of_some(model, train, params, clip, key)
+
+    def of_drawn() -> tuple[Array, dict[str, Array], Denoised | None]:
         shorter, drawn = draw_frames(model, clip, settings.frames, jax.random.fold_in(key, 9))
-        unchained = dataclasses.replace(train, chained=0.0)
-        return of_clips(shorter, unchained, params, drawn, key)
+        return of_some(shorter, dataclasses.replace(train, chained=0.0), params, drawn, key)
 
-    if not settings.whole:
-        return of_drawn()
-    whole = jax.random.bernoulli(jax.random.fold_in(key, 10), settings.whole)
-    return jax.lax.cond(whole, lambda: of_clips(model, train, params, clip, key), of_drawn)
+    if not 0 < settings.frames < length:
+        found = of_clips()
+    elif not settings.whole:
+        found = of_drawn()
+    else:
+        whole = jax.random.bernoulli(jax.random.fold_in(key, 10), settings.whole)
+        found = jax.lax.cond(whole, of_clips, of_drawn)
+    return with_lpips(model, train, params, *found)
 
 
 def draw_frames(
@@ -348,34 +398,37 @@ def perceptual_weights(model: AssembledModel, train: TrainSettings) -> Params | 
     return codec_losses.lpips_weights(train.denoised_lpips_net, model.clip)
 
 
-def denoised_distance(
-    model: AssembledModel,
-    net: lpips.Net,
-    params: Params,
-    clip: Clip,
-    x0_BthwC: Array,
-    times: Array,
-    key: Array,
-) -> Array:
-    """Return LPIPS between denoised and true colours of one frame, the mean over clips.
-
-    The frame is one of all but the first, the same in all clips. A clip's weight is the share of
-    the signal in the variance of its noisy latents: in noise nothing can be recognised, and LPIPS
-    would reward any sharp picture. ``params`` has the codec, and under ``lpips`` the network.
-    """
+def one_frame(
+    model: AssembledModel, clip: Clip, x0_BthwC: Array, times: Array, key: Array
+) -> Denoised:
+    """Return one of all frames but the first, the same in all clips, of denoised latents."""
     at = jax.random.randint(key, (), 1, x0_BthwC.shape[1])
 
     def frame(x_BT: Array) -> Array:
         return jax.lax.dynamic_slice_in_dim(x_BT, at, 1, axis=1)
 
-    colours = frame(x0_BthwC)[..., : model.codec.rgb_channels].astype(model.dtype)
-    made = model.codec.decode(params.get("codec", {}), colours)[:, 0].astype(jnp.float32)
-    truth = signal_from_rgb(frame(clip.frames.rgb_THWC))[:, 0]
-    distance_B = lpips.apply(net, params["lpips"], made, truth)
     ones, zeros = jnp.ones_like(x0_BthwC[..., :1]), jnp.zeros_like(x0_BthwC[..., :1])
     signal, noise = model.noise.corrupt(ones, zeros, times), model.noise.corrupt(zeros, ones, times)
-    share_B = (signal**2 / (signal**2 + noise**2)).mean((1, 2, 3, 4))
-    return (share_B * distance_B).mean()
+    return Denoised(
+        frame(x0_BthwC)[..., : model.codec.rgb_channels],
+        signal_from_rgb(frame(clip.frames.rgb_THWC))[:, 0],
+        (signal**2 / (signal**2 + noise**2)).mean((1, 2, 3, 4)),
+    )
+
+
+def denoised_distance(
+    model: AssembledModel, net: lpips.Net, params: Params, denoised: Denoised
+) -> Array:
+    """Return LPIPS between denoised and true colours, the mean over clips.
+
+    A clip's weight is the share of the signal: in noise nothing can be recognised, and LPIPS would
+    reward any sharp picture. ``params`` has the codec, and under ``lpips`` the network.
+    """
+    colours = denoised.colours_B1hwC.astype(model.dtype)
+    made = model.codec.decode(params.get("codec", {}), colours)[:, 0].astype(jnp.float32)
+    truth = jax.lax.stop_gradient(lpips.describe(net, params["lpips"], denoised.truth_BHWC))
+    distance_B = lpips.distance(params["lpips"], lpips.describe(net, params["lpips"], made), truth)
+    return (denoised.share_B * distance_B).mean()
 
 
 def first_frames(

@@ -47,7 +47,8 @@ def test_it_is_that_of_one_frame_and_counts_less_in_noise():
     @jax.jit
     def measured(x0, sigma, key):
         times = jnp.full((2,), sigma)
-        return objective.denoised_distance(MODEL, "alex", params, clip, x0, times, key)
+        denoised = objective.one_frame(MODEL, clip, x0, times, key)
+        return objective.denoised_distance(MODEL, "alex", params, denoised)
 
     key, off = jax.random.key(1), x0.at[..., 0].add(0.5)
     assert float(measured(x0, 1e-3, key)) == pytest.approx(0, abs=1e-5)
@@ -76,6 +77,23 @@ def test_it_is_added_with_its_weight_in_the_stages_that_have_it():
     other, few = losses(TRAIN, objective.with_memory)
     assert "lpips" not in few
     np.testing.assert_allclose(other, plain, rtol=1e-6)
+
+
+def test_it_is_outside_the_choice_between_whole_clips_and_drawn_frames():
+    params = init_world(MODEL) | {"lpips": NETWORK}
+    clip, key = clips(), jax.random.key(2)
+    stage = dataclasses.replace(TRAIN.joint, frames=1, whole=0.5)
+    kernels = [params["lpips"]["net"][f"conv_{k}"]["kernel"].shape for k in range(5)]
+
+    def inside(train):
+        traced = jax.make_jaxpr(lambda p: objective.joint(MODEL, train, p, clip, key))(params)
+        return str([e for e in traced.eqns if e.primitive.name == "cond"])
+
+    train = dataclasses.replace(TRAIN, joint=stage)
+    text = inside(train)
+    assert text != "[]"
+    for shape in kernels:
+        assert f"f32[{','.join(map(str, shape))}]" not in text
 
 
 def test_its_network_is_loaded_for_these_stages_alone(monkeypatch):
