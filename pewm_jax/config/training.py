@@ -269,10 +269,13 @@ class TrainSettings:
     (`frames` of a stage) are not chained."""
     denoised_lpips: float = 0.0
     """Weight of LPIPS between denoised and true colours, of one frame of every clip; 0 leaves it
-    out. Noisier clips count less. It makes few sampling steps sharp, and a step slower, so use it
-    in a second run that starts from a trained model. For the stages `joint` and `adapt`."""
+    out. A step takes longer, so use it in a second run that starts from a trained model. For the
+    stages `joint` and `adapt`."""
     denoised_lpips_net: Literal["alex", "vgg"] = "vgg"
     """The network of that LPIPS (`pip install 'pewm-jax[metrics]'`). Judge by the other one."""
+    denoised_lpips_weights: Literal["signal", "equal"] = "signal"
+    """What a clip counts in that LPIPS: `signal`: noisier ones count less, by the share of the
+    signal in the variance; `equal`: all count the same, also those of pure noise."""
     on_nonfinite: Literal["stop", "skip"] = "stop"
     """If a loss or gradient is not finite: `stop` training, or `skip` the update and count it."""
     grace_s: float = 30.0

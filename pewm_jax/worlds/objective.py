@@ -211,6 +211,8 @@ def with_lpips(
     """Add ``train.denoised_lpips`` times the distance of denoised frames, if any, to a loss."""
     if denoised is None:
         return total, measures
+    if train.denoised_lpips_weights == "equal":
+        denoised = denoised._replace(share_B=jnp.ones_like(denoised.share_B))
     distance = denoised_distance(model, train.denoised_lpips_net, params, denoised)
     return total + train.denoised_lpips * distance, measures | {"lpips": distance}
 
@@ -421,8 +423,8 @@ def denoised_distance(
 ) -> Array:
     """Return LPIPS between denoised and true colours, the mean over clips.
 
-    A clip's weight is the share of the signal: in noise nothing can be recognised, and LPIPS would
-    reward any sharp picture. ``params`` has the codec, and under ``lpips`` the network.
+    A clip's weight is its ``share_B``: in noise nothing can be recognised, and LPIPS would reward
+    any sharp picture. ``params`` has the codec, and under ``lpips`` the network.
     """
     colours = denoised.colours_B1hwC.astype(model.dtype)
     made = model.codec.decode(params.get("codec", {}), colours)[:, 0].astype(jnp.float32)

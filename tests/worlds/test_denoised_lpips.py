@@ -74,6 +74,10 @@ def test_it_is_added_with_its_weight_in_the_stages_that_have_it():
     whole, parts = losses(TRAIN, objective.joint)
     assert "lpips" not in few
     assert float(whole) == pytest.approx(float(plain) + 0.5 * float(parts["lpips"]), rel=1e-5)
+    equal = dataclasses.replace(TRAIN, denoised_lpips_weights="equal")
+    whole, all_parts = losses(equal, objective.joint)
+    assert float(all_parts["lpips"]) > float(parts["lpips"])
+    assert float(whole) == pytest.approx(float(plain) + 0.5 * float(all_parts["lpips"]), rel=1e-5)
     other, few = losses(TRAIN, objective.with_memory)
     assert "lpips" not in few
     np.testing.assert_allclose(other, plain, rtol=1e-6)
