@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -344,7 +344,8 @@ def of_stage(
     else:
         whole = jax.random.bernoulli(jax.random.fold_in(key, 10), settings.whole)
         found = jax.lax.cond(whole, of_clips, of_drawn)
-    return with_lpips(model, train, params, *found)
+    total, measures, denoised = cast("tuple[Array, dict[str, Array], Denoised | None]", found)
+    return with_lpips(model, train, params, total, measures, denoised)
 
 
 def draw_frames(
