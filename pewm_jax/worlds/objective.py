@@ -325,7 +325,7 @@ def of_stage(
     """Return ``loss`` of the frames that a step of this stage imagines (``StageConfig.frames``).
 
     Clips of drawn frames are not chained. LPIPS is outside the choice between whole clips and drawn
-    frames: inside, XLA's CPU backend took a second longer for it (`small2`, two cores).
+    frames: inside, XLA's CPU backend is slow.
     """
     settings, length = getattr(train, stage), model.clip.frames - 1
     of_some = functools.partial(denoise, memory=memory, perceptual=perceptual)
