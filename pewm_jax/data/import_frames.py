@@ -58,7 +58,7 @@ class BadFrames:
             which = f" (bad frame {len(self.damaged)})" if self.limit else ""
             raise UserError(
                 f"{sentence.rstrip('.')}{which}; nothing was added: repair it, or leave out up to "
-                "N such frames with --skip-bad N."
+                "N such frames with --skip_bad N."
             )
 
     def lines(self) -> Iterator[str]:

@@ -374,7 +374,7 @@ def test_bad_frames_are_left_out_up_to_a_number(tmp_path, name):
     images = {"7scenes": "*.color.png", "scannet": "color/*.jpg", "replica": "frame*.jpg"}[name]
     truncate(images, 2)(src)
     lose(images, 5)(src)
-    with pytest.raises(UserError, match=r"nothing was added.*--skip-bad N"):
+    with pytest.raises(UserError, match=r"nothing was added.*--skip_bad N"):
         imported(src, tmp_path / "out", name, skip_bad=1)
     (episode,), lines = imported(src, tmp_path / "out", name, skip_bad=2)
     assert "2 frames left out as bad; first:" in lines

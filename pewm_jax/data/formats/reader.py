@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class BadFrameError(UserError):
-    """One frame cannot be used; ``--skip-bad`` leaves such frames out."""
+    """One frame cannot be used; ``--skip_bad`` leaves such frames out."""
 
 
 @dataclasses.dataclass(frozen=True)
