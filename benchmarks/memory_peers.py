@@ -58,7 +58,10 @@ def slots(config: Memory, frames: Frames) -> np.ndarray:
     """Return (T, H, W) int64: the slot of every pixel; V − 1 is never occupied here."""
     voxels = voxel_map.empty(config, np.zeros(3), 1)
     frames = jax.tree.map(jnp.asarray, frames)
-    seen = voxel_frames.pixel_cells(config, voxels.origin_3, frames.depth_THW, frames.camera)
+    cell_THW, _ = voxel_frames.pixel_cells(
+        config, voxels.origin_3, frames.depth_THW, frames.camera, jnp.ones(T, bool)
+    )
+    seen = cell_THW[:, 1:-1, 1:-1]
     names, slot = np.unique(np.asarray(seen), return_inverse=True)
     assert len(names) < config.capacity, "the room fits into the map"
     return slot.reshape(seen.shape)

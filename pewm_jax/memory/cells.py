@@ -202,7 +202,7 @@ def maximum_over_blocks(
     result = jax.lax.platform_dependent(
         features_VF.astype(exact),
         largest_of_batch(count),
-        cpu=lambda rows_VF, count: run(4096, rows_VF, count),
+        cpu=lambda rows_VF, count: run(1024, rows_VF, count),
         default=lambda rows_VF, count: run(65536, rows_VF, count),
     )
     return result.astype(features_VF.dtype)

@@ -113,7 +113,7 @@ def insert_frames(
     Raises:
         UserError: frames, features and the map's channels do not fit together.
     """
-    no_cell, depth_THW = cells.nowhere(config), jnp.asarray(frames.depth_THW)
+    depth_THW = jnp.asarray(frames.depth_THW)
     count, channels = len(depth_THW), voxels.features_VF.shape[-1]
     shape = jnp.shape(features_ThwF)
     if len(shape) != 4 or (shape[0], shape[-1]) != (count, channels):
@@ -122,12 +122,8 @@ def insert_frames(
             f"{channels} channels; give ({count}, rows, columns, {channels})."
         )
     camera = jax.tree.map(jnp.asarray, frames.camera)
-    seen = voxel_frames.pixel_cells(config, voxels.origin_3, depth_THW, camera)
-    valid = depth_THW > 0
-    if valid_T is not None:
-        valid = valid & jnp.asarray(valid_T)[:, None, None]
-    beyond = (valid & (seen == no_cell)).sum(dtype=jnp.int32)
-    seen = jnp.where(valid, seen, no_cell)
+    valid_T = jnp.ones(count, bool) if valid_T is None else jnp.asarray(valid_T)
+    seen, beyond = voxel_frames.pixel_cells(config, voxels.origin_3, depth_THW, camera, valid_T)
     cell_V, rows, dropped = voxel_frames.insert(
         config, voxels.cell_of_slot_V, voxels.features_VF, seen, jnp.asarray(features_ThwF)
     )

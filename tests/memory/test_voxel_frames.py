@@ -21,6 +21,7 @@ T, H, W, F = 3, 32, 48, 5
 SEEDS = st.integers(0, 100_000)
 insert_frames = jax.jit(voxel_map.insert_frames, static_argnums=0)
 pixel_cells = jax.jit(voxel_frames.pixel_cells, static_argnums=0)
+compact = jax.jit(voxel_frames.compact, static_argnums=(2, 3))
 
 
 def blank(dtype=jnp.float32, channels=F):
@@ -52,6 +53,12 @@ def by_definition(frames, patches, valid_T):
     valid = (frames.depth_THW > 0) & valid_T[:, None, None]
     voxels = blank(channels=shape[-1])
     return voxel_map.insert(CONFIG, voxels, points, values, valid.reshape(-1))
+
+
+def cells_seen(frames):
+    """Return the cells (T, H, W) of valid pixels, with their border, and the number outside."""
+    valid_T = np.ones(len(frames.depth_THW), bool)
+    return pixel_cells(CONFIG, blank().origin_3, frames.depth_THW, frames.camera, valid_T)
 
 
 def take(clip, which):
@@ -91,13 +98,40 @@ def test_neither_order_nor_batching_nor_repetition_of_frames_matters():
 
 def test_few_corners_are_read_on_walls_and_all_of_them_on_noise():
     square, _ = voxel_frames.between(128, 6)
-    shares = []
+    no_cell = cells.nowhere(CONFIG)
+    shares, outside = [], []
     for kind in ("room", "noise"):
-        frames, _ = a_clip(2, kind, (1, 128, 128), holes=0)
-        seen = pixel_cells(CONFIG, blank().origin_3, frames.depth_THW, frames.camera)
-        shares.append(float(voxel_frames.corners(seen, square, square).mean()))
+        seen, count = cells_seen(a_clip(2, kind, (1, 128, 128), holes=0)[0])
+        found = voxel_frames.corners(seen, square, square, no_cell)
+        shares.append(float((found > 0).mean()))
+        outside.append(float(count) / 128**2)
+        assert not found[seen[:, 1:-1, 1:-1] == no_cell].any()
     assert shares[0] < 0.25
-    assert shares[1] > 0.8
+    assert shares[1] > 0.8 * (1 - outside[1])
+
+
+@examples(10)
+@given(seed=SEEDS, kind=st.sampled_from(["room", "noise"]))
+def test_every_cell_of_a_frame_is_that_of_one_of_its_first_pixels(seed, kind):
+    seen, _ = cells_seen(a_clip(seed, kind)[0])
+    squares = (voxel_frames.between(H, 4)[0], voxel_frames.between(W, 5)[0])
+    found = np.asarray(voxel_frames.corners(seen, *squares, cells.nowhere(CONFIG)))
+    for cell_HW, kind_HW in zip(np.asarray(seen)[:, 1:-1, 1:-1], found, strict=True):
+        firsts = set(cell_HW[kind_HW == 2])
+        assert firsts == set(cell_HW[cell_HW < cells.nowhere(CONFIG)])
+
+
+@examples(20)
+@given(seed=SEEDS, size=st.sampled_from([1, 31, 32, 33, 1024, 1025, 3000]))
+def test_compaction_lists_the_values_in_order(seed, size):
+    rng = np.random.default_rng(seed)
+    mask, values = rng.random(size) < rng.random(), np.arange(size, dtype=np.int32)
+    room = int(rng.integers(1, size + 1))
+    listed, count = compact(mask, values, room, -1)
+    expected = values[mask]
+    assert count == len(expected)
+    np.testing.assert_array_equal(listed[: len(expected)], expected[:room])
+    assert (listed[len(expected) :] == -1).all()
 
 
 @pytest.mark.slow
@@ -153,7 +187,9 @@ def test_every_point_projects_back_into_its_pixel_and_lies_in_its_cell(seed):
     np.testing.assert_allclose(z, depth.reshape(T, -1), rtol=1e-4)
 
     origin = blank().origin_3
-    found = pixel_cells(CONFIG, origin, depth, frames.camera).reshape(T, -1)
+    seen, outside = cells_seen(dataclasses.replace(frames, depth_THW=depth))
+    found = seen[:, 1:-1, 1:-1].reshape(T, -1)
+    assert outside == (found == cells.nowhere(CONFIG)).sum()
     place = np.asarray((points - origin) / np.asarray(CONFIG.cell_m))
     clear = (np.abs(place - np.round(place)) > 1e-4).all(-1)
     assert clear.mean() > 0.95
