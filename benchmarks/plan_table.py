@@ -44,6 +44,7 @@ RESULTS = Path(__file__).with_suffix(".json")
 ADDED = {
     "denoised_lpips": 0.0,
     "denoised_lpips_net": "vgg",
+    "denoised_lpips_weights": "signal",
     "frames": 0,
     "whole": 0.0,
     "last_alone": False,
