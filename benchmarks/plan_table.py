@@ -58,6 +58,8 @@ DEVICES = 8
 MANY = (("v5p", 64, 4), ("v5e", 256, 1))
 """Chip, number of devices and of slices: larger arrangements of the presets of ``LARGE``."""
 LARGE = ("pewm_2b", "pewm_5b")
+FSDP = {("pewm_5b", "v5e"): 32}
+"""Devices along ``fsdp`` where the preset's are too few for the chip's memory."""
 HEADS = {
     TRAINING: (
         *("model", "stage", "devices", "mesh", "memory of a device", "fits", "executed"),
@@ -82,6 +84,7 @@ class Piece:
         chip: the kind of device.
         devices: their number.
         slices: the number of slices that they make up.
+        fsdp: the number of them along ``fsdp``; 0 for the preset's.
     """
 
     table: str
@@ -91,11 +94,16 @@ class Piece:
     chip: Chip
     devices: int
     slices: int = 1
+    fsdp: int = 0
 
     @property
     def config(self) -> Config:
         """Return the settings."""
-        return presets.load(self.preset)
+        config = presets.load(self.preset)
+        if not self.fsdp:
+            return config
+        mesh = dataclasses.replace(config.train.mesh, fsdp=self.fsdp)
+        return dataclasses.replace(config, train=dataclasses.replace(config.train, mesh=mesh))
 
     @property
     def key(self) -> str:
@@ -162,9 +170,9 @@ def pieces(which: str, options: argparse.Namespace) -> Iterator[Piece]:
     if which == TRAINING and not options.devices:
         wanted = [one for one in MANY if not options.chips or one[0] in options.chips]
         for (name, devices, slices), preset in itertools.product(wanted, LARGE):
-            chip = chips.named(name)
+            chip, fsdp = chips.named(name), FSDP.get((preset, name), 0)
             for stage in runs.planned(presets.load(preset)) if preset in options.presets else ():
-                yield Piece(which, preset, stage.name, stage.title, chip, devices, slices)
+                yield Piece(which, preset, stage.name, stage.title, chip, devices, slices, fsdp)
 
 
 def compiled(missing: list[Piece]) -> Iterator[tuple[Piece, dict[str, Any]]]:

@@ -26,9 +26,9 @@ from pewm_jax.types import Array, Camera
 BLOCK = 32
 """Number of elements that one product with a triangular matrix sums up (``running_sum``)."""
 SHORT = (8, 64)
-"""The shares of pixels, 1 / n, that may be corners and first pixels if a short list is sorted."""
+"""The shares of pixels, 1 / n, that may be corners and first pixels for shorter lists to sort."""
 WORTH_A_BRANCH = 1024
-"""Number of first pixels from which the short list pays off."""
+"""Number of first pixels from which shorter lists pay off."""
 
 
 def pixel_cells(
@@ -184,11 +184,14 @@ def insert(
         new_V, dropped = admitted(index_P)
     else:
         few = index_P[:corner_room]
-        fits = (count <= corner_room) & (firsts <= first_room)
-        new_V, dropped = jax.lax.cond(
-            cells.largest_of_batch(~fits),
-            lambda: admitted(index_P),
-            lambda: admitted(compact(few < 0, few, first_room, size)[0]),
+        longer = jnp.where(firsts <= first_room, 0, 1)
+        new_V, dropped = jax.lax.switch(
+            cells.largest_of_batch(jnp.where(count <= corner_room, longer, 2)),
+            (
+                lambda: admitted(compact(few < 0, few, first_room, size)[0]),
+                lambda: admitted(few),
+                lambda: admitted(index_P),
+            ),
         )
     patches = features_ThwF.reshape(-1, channels).astype(jnp.float32)
     square_H, square_W, down_H, right_W = map(jnp.asarray, (square_H, square_W, down_H, right_W))
