@@ -49,6 +49,19 @@ def tiny_model(**sections) -> PEWM:
     return dataclasses.replace(TINY, **sections)
 
 
+def shrink(model, frames=3, side=16):
+    """Return a world model without depth of one tiny block, on pixels, with one sampling step."""
+    return dataclasses.replace(
+        model,
+        clip=ClipConfig(frames=frames, height=side, width=side, depth=False),
+        codec=PixelConfig(temporal=1),
+        backbone=DiTBackbone(
+            layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16
+        ),
+        noise=dataclasses.replace(model.noise, sample_steps=1),
+    )
+
+
 def with_reader(model: PEWM, **changes) -> PEWM:
     """Return a model whose reader of the memory has other settings."""
     reader = dataclasses.replace(model.memory.reader, **changes)

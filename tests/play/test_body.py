@@ -12,18 +12,16 @@ from pewm_jax import presets
 from pewm_jax.bodies.humanoid import HUMANOID
 from pewm_jax.cli import play
 from pewm_jax.cli.play import Settings
-from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import ClipConfig, UserError, serialize
+from pewm_jax.config import UserError, serialize
 from pewm_jax.data.collect import collect
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.play import board, driver, engine, joints, page, places, saved, session
 from pewm_jax.play.settings import Serve, Start
 from pewm_jax.types import Frames, WorldState
 from pewm_jax.worlds.egowm.world import EgoWM
-from tests.helpers import randomised
+from tests.helpers import randomised, shrink
 from tests.play.tiny_drive import FORWARD, LEFT, Telling
 
 LONG = 120
@@ -33,16 +31,7 @@ SIZE = 24
 @functools.cache
 def config():
     loaded = presets.load("egowm_humanoid")
-    model = dataclasses.replace(
-        loaded.model,
-        clip=ClipConfig(frames=3, height=SIZE, width=SIZE, depth=False),
-        codec=PixelConfig(temporal=1),
-        backbone=DiTBackbone(
-            layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16
-        ),
-        noise=dataclasses.replace(loaded.model.noise, sample_steps=1),
-    )
-    return dataclasses.replace(loaded, model=model)
+    return dataclasses.replace(loaded, model=shrink(loaded.model, side=SIZE))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets
-from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ClipConfig, ConfigError, UserError
+from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data.collect import collect
 from pewm_jax.data.make_episode import CollectConfig
-from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.studies import conditioning, step_times
 from pewm_jax.studies.conditioning import ROWS, Study
+from tests.helpers import shrink
 
 SIZE = 16
 
@@ -24,19 +23,10 @@ SIZE = 16
 def base(data="data/none", preset="egowm"):
     """The preset, absurdly small."""
     loaded = presets.load(preset)
-    model = dataclasses.replace(
-        loaded.model,
-        clip=ClipConfig(frames=3, height=SIZE, width=SIZE, depth=False),
-        codec=PixelConfig(temporal=1),
-        backbone=DiTBackbone(
-            layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16
-        ),
-        noise=dataclasses.replace(loaded.model.noise, sample_steps=1),
-    )
     stage = dataclasses.replace(loaded.train.adapt, batch=2, warmup=1)
     return dataclasses.replace(
         loaded,
-        model=model,
+        model=shrink(loaded.model, side=SIZE),
         data=dataclasses.replace(
             loaded.data, path=data, prepared=4, prepared_path="", refresh=0, context=2
         ),
