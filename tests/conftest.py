@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import tempfile
+import types
 from pathlib import Path
 
 import pytest
@@ -137,3 +138,12 @@ def pytest_collection_modifyitems(items):
             case = item.callspec.id
             if case in texts if how == "but" else not any(text in case for text in texts):
                 item.own_markers.remove(mark)
+
+
+@pytest.fixture
+def has_cudnn(monkeypatch):
+    """Name a version of cuDNN, for which JAX asks while tracing."""
+    from jax._src.cudnn import fused_attention_stablehlo as cudnn
+
+    version = types.SimpleNamespace(cudnn_get_version=lambda: 91000)
+    monkeypatch.setattr(cudnn, "cuda_versions", version)

@@ -1,4 +1,4 @@
-"""Abstract frames and batches (shapes and dtypes), for compiling before data is read."""
+"""Abstract frames, controls and batches (shapes and dtypes), for compiling before data is read."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from pewm_jax.config import Config
+from pewm_jax.config import Config, World
 from pewm_jax.config.world import PLANAR
-from pewm_jax.types import Camera, Clip, Frames
+from pewm_jax.types import Array, Camera, Clip, Control, Frames
 
 
 def camera(*lead: int) -> Camera:
@@ -46,6 +46,23 @@ def clip(config: Config, batch: int, *, features: bool = False, actions: bool = 
         array(batch, context, dtype=np.bool_),
         array(batch, size.frames - 1, asked.actions or PLANAR) if actions else None,
         extras,
+    )
+
+
+def control(world: World, *lead: int) -> Array | Control:
+    """Return what steers a world through steps of leading shape ``lead``, (…, n).
+
+    It is planar actions, or cameras with recorded actions and the agent's state if the world needs
+    them.
+    """
+    asked = world.batch_spec
+    if asked.actions in (0, PLANAR):
+        return array(*lead, PLANAR)
+    state = dict(asked.extras).get("state_A")
+    return Control(
+        camera(*lead),
+        array(*lead, asked.actions),
+        None if state is None else array(*lead[:-1], *state.shape),
     )
 
 

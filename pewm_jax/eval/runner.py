@@ -28,7 +28,7 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.config import Config, UserError
 from pewm_jax.data import abstract
-from pewm_jax.eval.clips import later_control, steered_by_record
+from pewm_jax.eval.clips import later_control
 from pewm_jax.eval.reproject import ReprojectSettings, reproject_batch
 from pewm_jax.io.store import Workers
 from pewm_jax.report.labels import OWN_METHODS
@@ -100,14 +100,8 @@ class ModelRunner:
         length = self.config.model.clip.frames - 1
         steps = self.config.model.sample_steps
         steps = f"{steps} steps, " if steps else ""
-        control = abstract.array(self.batch, length, 3)
-        if steered_by_record(self.config.model):
-            spec = self.config.model.batch_spec
-            actions = abstract.array(self.batch, length, spec.actions)
-            state = dict(spec.extras).get("state_A")
-            before = None if state is None else abstract.array(self.batch, *state.shape)
-            control = Control(abstract.camera(self.batch, length), actions, before)
-        elif self.cameras:
+        control = abstract.control(self.config.model, self.batch, length)
+        if self.cameras and not isinstance(control, Control):
             control = abstract.camera(self.batch, length)
         keys = jax.eval_shape(clip_keys, jax.ShapeDtypeStruct((self.batch, 2), jnp.uint32))
         for memory in memories:

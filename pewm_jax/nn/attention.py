@@ -154,24 +154,49 @@ def flash(q_BNKD: Array, k_BMKD: Array, v_BMKD: Array, implementation: Any) -> A
     """Compute attention (B, N, K, d) by a kernel of ``jax.nn.dot_product_attention``.
 
     The gradient of cuDNN's kernel refuses odd numbers of queries or keys (jax 0.10), so these get
-    one token of padding, which is masked and dropped.
+    one token of padding, which is masked and dropped. Under ``vmap`` the kernel wants either all
+    arrays to be mapped or none, the lengths included.
     """
     batch, queries, keys = *q_BNKD.shape[:2], k_BMKD.shape[1]
+    total = jnp.stack([x.ravel()[0] for x in (q_BNKD, k_BMKD, v_BMKD)]).sum()
+    q_BNKD, k_BMKD, v_BMKD = (_mapped_like(total, x) for x in (q_BNKD, k_BMKD, v_BMKD))
     if queries % 2 == 0 and keys % 2 == 0:
-        return jax.nn.dot_product_attention(q_BNKD, k_BMKD, v_BMKD, implementation=implementation)
+        out = jax.nn.dot_product_attention(q_BNKD, k_BMKD, v_BMKD, implementation=implementation)
+        return _mapped_like(total, out)
 
     def even(x: Array) -> Array:
         return jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0)))
 
+    of_queries, of_keys = (
+        jnp.where(total > 0, count, jnp.full((batch,), count, jnp.int32))
+        for count in (queries, keys)
+    )
     out = jax.nn.dot_product_attention(
         even(q_BNKD),
         even(k_BMKD),
         even(v_BMKD),
-        query_seq_lengths=jnp.full((batch,), queries, jnp.int32),
-        key_value_seq_lengths=jnp.full((batch,), keys, jnp.int32),
+        query_seq_lengths=of_queries,
+        key_value_seq_lengths=of_keys,
         implementation=implementation,
     )
-    return out[:, :queries]
+    return _mapped_like(total, out)[:, :queries]
+
+
+@jax.custom_vjp
+def _mapped_like(number: Array, x: Array) -> Array:
+    """Return x, and its gradient, mapped by ``vmap`` as a number is; XLA removes the choice."""
+    return jnp.where(number > 0, x, x)
+
+
+def _mapped_like_forward(number: Array, x: Array) -> tuple[Array, Array]:
+    return _mapped_like(number, x), number
+
+
+def _mapped_like_backward(number: Array, grad: Array) -> tuple[Array, Array]:
+    return jnp.zeros_like(number), _mapped_like(number, grad)
+
+
+_mapped_like.defvjp(_mapped_like_forward, _mapped_like_backward)
 
 
 def fits_flash(q_BKND: Any) -> bool:

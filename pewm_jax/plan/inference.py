@@ -106,10 +106,10 @@ def program(config: Config, name: str, quantize: str = "") -> Program:
         seen = _frames(config, count)
         return Program(functools.partial(worlds.observe, world), (params, state, seen))
     if kind == CLIP:
-        moves = abstract.array(count, 3)
+        moves = abstract.control(world, count)
         return Program(functools.partial(worlds.imagine, world), (params, state, moves, key))
     assert kind == MANY
-    moves = abstract.array(CANDIDATES, count, 3)
+    moves = abstract.control(world, CANDIDATES, count)
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), CANDIDATES))
     return Program(functools.partial(worlds.imagine_many, world), (params, state, moves, keys))
 

@@ -1,7 +1,6 @@
 """Attention in pieces and by kernels is attention, whatever the sizes and the hardware."""
 
 import functools
-import types
 
 import jax
 import jax.numpy as jnp
@@ -118,15 +117,6 @@ def test_flash_attention_is_refused_where_there_is_none_and_taken_where_there_is
     assert asked == [((2, 14, 3, 8), "cudnn", lengths)], "16 bits alone, tokens in front of heads"
 
 
-@pytest.fixture
-def has_cudnn(monkeypatch):
-    """Name a version of cuDNN, for which JAX asks while tracing."""
-    from jax._src.cudnn import fused_attention_stablehlo as cudnn
-
-    version = types.SimpleNamespace(cudnn_get_version=lambda: 91000)
-    monkeypatch.setattr(cudnn, "cuda_versions", version)
-
-
 ODD = [(9, 9), (9, 10), (10, 9), (1, 1), (17, 2), (8, 8)]
 
 
@@ -141,6 +131,49 @@ def test_cudnn_traces_gradients_of_any_length(has_cudnn, queries, keys):
     with target.use(H100):
         traced = str(jax.make_jaxpr(jax.grad(total, (0, 1, 2)))(*half))
     assert "dot_product_attention_bwd_wrapper" in traced
+
+
+@pytest.mark.parametrize("axes", [(0, None, None), (None, 0, 0), (0, 0, 0), (1, None, 0)])
+@pytest.mark.parametrize(("queries", "keys"), [(9, 9), (8, 8)])
+def test_cudnn_traces_what_vmap_maps_over_some_or_all_arrays(has_cudnn, queries, keys, axes):
+    half = [x.astype(jnp.bfloat16) for x in inputs(queries=queries, keys=keys)]
+    stacked = [
+        x if axis is None else jnp.stack([x] * 4, axis) for x, axis in zip(half, axes, strict=True)
+    ]
+
+    def total(*x):
+        return blocked_attention.attention(*x).astype(jnp.float32).sum()
+
+    with target.use(H100):
+        slopes = jax.vmap(jax.grad(total, (0, 1, 2)), axes)
+        one = jax.make_jaxpr(slopes)(*stacked)
+        other = jax.make_jaxpr(jax.grad(lambda *x: jax.vmap(total, axes)(*x).sum()))(*stacked)
+    for traced in (one, other):
+        assert "dot_product_attention_bwd_wrapper" in str(traced)
+    assert one.out_avals[0].shape == (4, *half[0].shape)
+
+
+@pytest.mark.parametrize("axes", [(0, None, None), (None, 0, 0)])
+def test_mapping_over_some_arrays_changes_neither_results_nor_gradients(axes):
+    q, k, v = inputs(queries=9, keys=9)
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=q.shape))
+    stacked = [
+        x if axis is None else jnp.stack([x, 2 * x])
+        for x, axis in zip((q, k, v), axes, strict=True)
+    ]
+
+    def slopes(attend):
+        def total(*x):
+            return (jax.vmap(attend, axes)(*x) * weight).sum()
+
+        return jax.grad(total, (0, 1, 2))(*stacked)
+
+    def padded(q, k, v):
+        swapped = (x.swapaxes(1, 2) for x in (q, k, v))
+        return blocked_attention.flash(*swapped, "xla").swapaxes(1, 2)
+
+    for got, want in zip(slopes(padded), slopes(blocked_attention.plain_attention), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow(but=("9-9", "10-9"))

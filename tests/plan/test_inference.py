@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets, worlds
-from pewm_jax.config import ConfigError, Launch, UserError
+from pewm_jax.config import ConfigError, Launch, UserError, World
+from pewm_jax.nn import target
+from pewm_jax.nn.target import Target
 from pewm_jax.plan import inference, plan, target_compiler, topology
 from pewm_jax.plan.target_compiler import StageReport
 from pewm_jax.train import chips
@@ -65,6 +67,21 @@ def test_every_program_can_be_traced_and_its_work_counted(name):
     lines = traced.lower().as_text().splitlines()
     main = next(line for line in lines if "func.func public @main" in line)
     assert main.count("%arg") == len(jax.tree.leaves(program.arguments)), "no weight is dropped"
+
+
+@pytest.mark.slow(but=("tiny-h100", "egowm_tiny-h100"))
+@pytest.mark.parametrize("chip", ["h100", "v5e"])
+@pytest.mark.parametrize(
+    "preset", [name for name in presets.names() if isinstance(presets.load(name).model, World)]
+)
+def test_programs_of_every_world_are_traced_for_chips(has_cudnn, preset, chip):
+    config = presets.load(preset).with_model(dtype="bfloat16")
+    platform = chips.named(chip).platform
+    where = Target(platform, (9, 0) if platform == "cuda" else (0, 0))
+    for name in inference.names(config):
+        program = inference.program(config, name)
+        with target.use(where):
+            jax.make_jaxpr(program.function)(*program.arguments)
 
 
 @pytest.mark.slow
