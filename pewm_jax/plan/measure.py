@@ -80,7 +80,7 @@ class MeshSizes:
         """Return the axes along which devices communicate: all along them, or some of these."""
         exact = self.groups.get(tuple(sorted(group)))
         around = [axes for whole, axes in self.groups.items() if set(group) <= set(whole)]
-        if exact or len(group) != 2 or not around:  # a permutation names pairs
+        if exact or not around:
             return exact or "other"
         return min(around, key=lambda axes: axes.count("+"))
 

@@ -43,6 +43,9 @@ _TARGET = re.compile(r'custom_call_target="([^"]+)"')
 _FUSION = re.compile(r'"fusion_backend_config":\{"kind":"_*([\w$]+)"')
 _SPLASH = re.compile(r"splash_\w+")
 _CONTINUED = re.compile(r'"flag_start":"(?!-1")')
+_SLICES_SUM = re.compile(
+    r'megascale_target="\{([\d,]+)\}x\{(\d+)(?::(\d+))?\}",_xla_megascale_transfer_type="(\w+)"'
+)
 _KERNEL = re.compile(r"dim_labels=\w+_(\w+)->")
 
 
@@ -182,8 +185,12 @@ class _Walk:
         """Yield a ``Collective`` for each operand of a communication instruction.
 
         A TPU splits communication into parts that run beside other work; the first part counts.
+        Between slices of TPUs it is a ``send`` through the hosts, whose attributes say what it is.
         """
         kind, group = line.opcode.removesuffix("-start"), line.group
+        if line.opcode == "send":
+            kind, group = _between_slices(line)
+            line = dataclasses.replace(line, operands=line.operands[:1])
         if kind not in COLLECTIVES or _CONTINUED.search(line.rest):
             return
         lines, ring = self.computations[computation], (len(group) - 1) / max(len(group), 1)
@@ -257,6 +264,21 @@ class _Walk:
             for place, name in enumerate(line.operands)
             if name in lines and place in parameters
         )
+
+
+def _between_slices(send: Line) -> tuple[str, tuple[int, ...]]:
+    """Return kind and group of communication between slices, or "" and none for another ``send``.
+
+    Its target, such as ``{1,2}x{0:3}``, lists slices from 1 and the devices of a slice, each of
+    which communicates with those of the same number in the other slices.
+    """
+    found = _SLICES_SUM.search(send.rest)
+    if found is None:
+        return "", ()
+    first = int(found[2])
+    size = int(found[3] or first) + 1
+    group = tuple((int(number) - 1) * size + first for number in found[1].split(","))
+    return found[4].lower().replace("_", "-"), group
 
 
 def _in_memory(line: Line) -> float:

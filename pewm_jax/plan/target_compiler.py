@@ -15,11 +15,13 @@ import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+import traceback
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -165,7 +167,7 @@ def _ask(
         path = os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH", ""))))
         done = subprocess.run(  # noqa: S603 - this library's own module
             [sys.executable, "-m", "pewm_jax.plan.target_compiler", str(asked), str(answered)],
-            env={**os.environ, **topology.ENVIRONMENT, "PYTHONPATH": path},
+            env={**os.environ, **topology.ENVIRONMENT, "PYTHONPATH": path, "TMPDIR": folder},
             capture_output=True,
             text=True,
             errors="replace",
@@ -199,9 +201,10 @@ def _plugins(config: Any) -> list[tuple[str, str]]:
 
 
 def main(asked: str, answered: str) -> None:
-    """Answer a request of ``_ask``: read its file and write the report's."""
+    """Answer a request of ``_ask``: read its file and write the report's, in the same folder."""
     request = json.loads(Path(asked).read_text())
-    threading.Thread(target=_exit_after, args=(request["parent"],), daemon=True).start()
+    watched = request["parent"], Path(asked).parent
+    threading.Thread(target=_exit_after, args=watched, daemon=True).start()
     try:
         for name, file in request["plugins"]:
             _load(name, file)
@@ -214,13 +217,19 @@ def main(asked: str, answered: str) -> None:
         answer = dataclasses.asdict(report)
     except UserError as error:
         answer = {"error": str(error)}
+    except Exception as error:  # noqa: BLE001 - the process that asked raises it
+        traceback.print_exc()
+        sentence = f"{type(error).__name__}: {' '.join(str(error).split())[:400]}"
+        name, chip = request["name"], request["chip"]
+        answer = {"error": f"The plan of {name} for {chip} failed with {sentence}"}
     Path(answered).write_text(json.dumps(answer))
 
 
-def _exit_after(parent: int) -> None:
-    """End this process once its parent has ended, even if it was killed."""
+def _exit_after(parent: int, folder: Path) -> None:
+    """End this process once its parent has ended, even if it was killed, and remove its folder."""
     while os.getppid() == parent:
         time.sleep(0.5)
+    shutil.rmtree(folder, ignore_errors=True)
     os._exit(1)
 
 
@@ -275,7 +284,7 @@ def _inference(config: Config, name: str, chip: Chip, quantize: str) -> StageRep
 
     program = inference.program(config, name, quantize)
     began = time.monotonic()
-    traced = inference.trace(program, topology.devices(chip, 1)[0])
+    traced = inference.trace(program, topology.one_device(chip))
     lowered = traced.lower()
     trace_s = time.monotonic() - began
     report = StageReport(

@@ -173,6 +173,7 @@ def devices(chip: Chip, count: int, slices: int = 1) -> Sequence[Any]:
         UserError: the chip has no topology of this many devices.
     """
     require_slices(chip, slices)
+    from jax.errors import JaxRuntimeError  # noqa: PLC0415
     from jax.experimental import topologies  # noqa: PLC0415 - loads the compiler's library
 
     if chip.platform == "cuda":
@@ -188,17 +189,30 @@ def devices(chip: Chip, count: int, slices: int = 1) -> Sequence[Any]:
         )
         return described.devices
     options = {"chip_config_name": "megacore"} if chip.name == "v4" else {}
-    described = topologies.get_topology_desc(
-        platform="tpu",
-        topology_name=tpu_topology(chip, count // slices),
-        **({"num_slices": slices} if slices > 1 else {}),
-        **options,
-    )
-    if len(described.devices) != count:
-        raise UserError(
-            f"--devices is {count}: {chip.name} has topologies of {len(described.devices)} devices."
+    try:
+        described = topologies.get_topology_desc(
+            platform="tpu",
+            topology_name=tpu_topology(chip, count // slices),
+            **({"num_slices": slices} if slices > 1 else {}),
+            **options,
         )
+    except JaxRuntimeError as error:
+        raise _no_topology(chip, count) from error
+    if len(described.devices) != count:
+        raise _no_topology(chip, count)
     return described.devices
+
+
+def one_device(chip: Chip) -> Any:
+    """Return one described device, of the smallest topology that a chip has."""
+    return devices(chip, 2 if chip.name == "tpu7x" else 1)[0]
+
+
+def _no_topology(chip: Chip, count: int) -> UserError:
+    return UserError(
+        f"--devices is {count}: {chip.name} has no topology of that many; use a power of 2"
+        f"{', at least 2' if chip.name == 'tpu7x' else ''}."
+    )
 
 
 def require_slices(chip: Chip, slices: int) -> None:
@@ -229,9 +243,7 @@ def tpu_topology(chip: Chip, count: int) -> str:
         if math.prod(shape) == chips and (chips < 4 or sum(side % 2 == 0 for side in shape) >= 2)
     ]
     if odd or not shapes:
-        raise UserError(
-            f"--devices is {count}: {chip.name} has no topology of that many; use a power of 2."
-        )
+        raise _no_topology(chip, count)
     shape = min(shapes, key=lambda sides: max(sides) - min(sides))
     if axes == 3:
         shape = sorted(shape, reverse=chips <= 4)  # a host is 2 × 2 × 1

@@ -59,7 +59,7 @@ CHIPS = (
     ),
     Chip(
         name="rtx4090",
-        device_kind=r"(NVIDIA )?(GeForce )?RTX 4090",
+        device_kind=r"(NVIDIA )?(GeForce )?RTX ?4090",
         flops=165.2e12,
         memory=24e9,
         bandwidth=1008e9,

@@ -53,3 +53,8 @@ def test_figures_have_the_size_of_what_is_built():
         assert 1.6e10 < chip.memory < 1e12, chip
         assert 8e11 < chip.bandwidth < 1e13, chip
         assert chip.network < chip.link < chip.bandwidth, chip
+
+
+def test_every_chip_is_found_by_its_name():
+    for chip in chips.CHIPS:
+        assert chips.named(chip.name) is chip
