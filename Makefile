@@ -25,7 +25,7 @@ help:
 	@echo "make lint         ruff (format and rules) and pyright"
 	@echo "make format       format the files with ruff"
 	@echo "make bench        benchmarks, each against a named baseline"
-	@echo "make clean        remove .venv and .venv-newest (data/ and runs/ stay)"
+	@echo "make clean        remove the virtual environments (data/ and runs/ stay)"
 
 .venv/made:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -63,17 +63,25 @@ test: .venv/installed-dev
 	@PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
 	  -m "not slow" --hypothesis-profile quick $(ARGS)
 
-# The compilers of TPUs and NVIDIA GPUs, without which a few tests are skipped; 2 GB.
-.venv/installed-plan: .venv/installed-dev
-	@$(PY) -m pip install --quiet --disable-pip-version-check --editable '.[plan-tpu,plan-cuda]'
+# The compilers of TPUs and NVIDIA GPUs, without which a few tests are skipped; 2 GB, in an
+# environment of their own, where JAX would look for devices at every start.
+.venv-plan/installed: .venv/made pyproject.toml
+	@echo "installing the compilers of TPUs and NVIDIA GPUs (2 GB) …"
+	@rm -rf .venv-plan && $(PYTHON) -m venv .venv-plan
+	@.venv-plan/bin/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,plan-tpu,plan-cuda]'
 	@touch $@
 
 # ARGS="--only training --chips h100 --presets pewm_2b" compiles a part; --record rewrites the page.
-plan-table: .venv/installed-plan
+ifeq ($(filter --recorded,$(ARGS)),)
+plan-table: .venv-plan/installed
+	@JAX_PLATFORMS=cpu .venv-plan/bin/python benchmarks/plan_table.py $(ARGS)
+else
+plan-table: .venv/installed
 	@$(PY) benchmarks/plan_table.py $(ARGS)
+endif
 
-test-all: .venv/installed-plan
-	@JAX_PLATFORMS=cpu PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+test-all: .venv-plan/installed
+	@JAX_PLATFORMS=cpu PYTHONDONTWRITEBYTECODE= .venv-plan/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-newest:
 	@PYTHON="$(PYTHON)" .ci/newest $(NEWEST) $(ARGS)
@@ -96,4 +104,4 @@ bench: .venv/installed-dev
 	@for name in $(BENCH); do echo "== $$name"; $(PY) benchmarks/$$name.py || exit 1; done
 
 clean:
-	rm -rf .venv .venv-newest
+	rm -rf .venv .venv-newest .venv-plan

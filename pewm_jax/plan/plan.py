@@ -58,7 +58,10 @@ COMPILED_MEMORY = (
     ("peak", "peak_bytes"),
 )
 """Label and ``StageReport`` field of each line in the memory table of a chip's compiler."""
-ESTIMATED = "Estimated from formulas and a program for CPUs; mfu is that of the predicted step."
+ESTIMATED = (
+    "Estimated from formulas and a program for CPUs; mfu is that of the predicted step. The chip's "
+    "own compiler may need a third less memory: --compiler target asks it."
+)
 """What is uncertain about the numbers of a plan without the chip's compiler."""
 
 
@@ -320,6 +323,7 @@ def lines(plan: StagePlan) -> Iterator[str]:
         yield (
             f"    {duration(best.time.step_s)}/step, {size(best.memory.peak)}, {fits}: {best.flags}"
         )
+    yield f"  {ESTIMATED}"
 
 
 def adapters(config: Config, stage: Stage) -> str:

@@ -190,7 +190,8 @@ def memory_of(
         )
     )
     clip = abstract.clip(config, stage.settings(config).batch, features=stage.memory)
-    batch = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(clip))
+    read = clip if stage.memory else (clip.frames, clip.actions_TA, clip.extras)
+    batch = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(read))
     gradients = FLOAT * counts(config, stage)["trained"].on(mesh)
     rest = None
     if compiled is not None:

@@ -1,14 +1,18 @@
 """The tables of all presets: kept programs, rows, and the page."""
 
 import dataclasses
+import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from pewm_jax import presets
 from pewm_jax.config import DataConfig, UserError
-from pewm_jax.plan import inference
+from pewm_jax.plan import inference, suggest
+from pewm_jax.plan.measure import MeshSizes
+from pewm_jax.train import runs
 from tests.plan.test_target_compiler import report
 
 ROOT = Path(__file__).parents[2]
@@ -115,17 +119,31 @@ def test_the_page_s_tables_are_the_recorded_ones(tables):
         )
 
 
+@pytest.mark.parametrize(("preset", "stage"), [("pewm_2b", "stage1"), ("egowm_cosmos2b", "adapt")])
+def test_state_and_batch_are_estimated_as_the_compiler_counts_them(tables, preset, stage):
+    plan_table, _ = tables
+    recorded = json.loads(plan_table.RESULTS.read_text())[f"training/{preset}-{stage}-h100-8"]
+    config = presets.load(preset)
+    (found,) = (one for one in runs.planned(config) if one.name == stage)
+    memory = suggest.memory_of(config, found, MeshSizes(**recorded["report"]["mesh"]))
+    assert memory.state == pytest.approx(recorded["report"]["argument_bytes"], rel=0.01)
+
+
 @pytest.mark.parametrize(
-    ("goal", "command"),
-    [("plan-table", "benchmarks/plan_table.py --recorded"), ("test-all", "pytest")],
+    ("goal", "arguments", "command", "compilers"),
+    [
+        ("plan-table", "--only training", "benchmarks/plan_table.py --only training", True),
+        ("plan-table", "--recorded", "benchmarks/plan_table.py --recorded", False),
+        ("test-all", "-x", "pytest", True),
+    ],
 )
-def test_make_runs_the_command_with_the_compilers_installed(goal, command):
+def test_make_installs_the_compilers_for_what_needs_them(goal, arguments, command, compilers):
     done = subprocess.run(
-        ["make", "--dry-run", "--always-make", goal, "ARGS=--recorded"],
+        ["make", "--dry-run", "--always-make", goal, f"ARGS={arguments}"],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,
     )
     assert command in done.stdout
-    assert "plan-tpu,plan-cuda" in done.stdout
+    assert ("plan-tpu,plan-cuda" in done.stdout) == compilers
