@@ -28,6 +28,7 @@ from pewm_jax.io import tree
 from pewm_jax.models.cogvideox import vae
 from pewm_jax.models.cogvideox.convert import VAE
 from pewm_jax.models.cogvideox.vae import VAECodec
+from pewm_jax.nn import target
 
 NAME = "cogvideox_vae"
 GOAL = 0.8
@@ -152,7 +153,7 @@ def main() -> None:
         clip = " × ".join(map(str, args.clip))
         print(
             f"decoding {clip} in {args.dtype}{' in tiles' * args.tiling}: {spare:.1f} GiB of "
-            f"temporaries and {out:.2f} GiB of video on {jax.default_backend()} "
+            f"temporaries and {out:.2f} GiB of video on {target.current().platform} "
             f"(compiled in {time.perf_counter() - start:.0f} s)"
         )
         return

@@ -296,8 +296,10 @@ def arguments(argv: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--only", choices=tuple(CHIPS), help="one of the tables")
-    parser.add_argument("--presets", nargs="+", default=PRESETS)
-    parser.add_argument("--chips", nargs="+", default=())
+    parser.add_argument("--presets", nargs="+", choices=presets.names(), default=PRESETS)
+    parser.add_argument(
+        "--chips", nargs="+", choices=[chip.name for chip in chips.CHIPS], default=()
+    )
     parser.add_argument(
         "--names", nargs="+", default=(), help="stages or programs, such as clip-50"
     )

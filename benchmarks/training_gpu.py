@@ -150,7 +150,9 @@ def report(done: dict[str, dict[str, Any]]) -> str:
 
 def has_gpu() -> bool:
     """Whether JAX sees an NVIDIA GPU; asked in another process, which takes no memory of it."""
-    code = "import sys, jax; sys.exit(jax.default_backend() != 'gpu')"
+    code = (
+        "import sys; from pewm_jax.nn import target; sys.exit(target.current().platform != 'cuda')"
+    )
     return subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

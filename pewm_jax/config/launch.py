@@ -112,6 +112,10 @@ class Launch(Join):
             self.slices == 1 or self.compiler == "target",
             f"--slices {self.slices} describes devices for their compiler: add --compiler target.",
         )
+        require(
+            self.compiler == "cpu" or self.compiled != "off",
+            "--compiler target compiles and --compiled off does not: give one of them.",
+        )
         for name in ("fit", "inference"):
             require(
                 not getattr(self, name) or self.compiler == "target",

@@ -65,19 +65,51 @@ def test_few_tokens_are_not_cut():
     assert "stablehlo.while" not in text
 
 
-@pytest.mark.parametrize("logits", [300, 100])
-def test_gradients_are_those_of_the_whole(monkeypatch, logits):
-    q, k, v = inputs()
+def reference(q, k, v):
+    """Attention in NumPy's order of operations, in float32."""
+    q, k, v = (x.astype(jnp.float32) for x in (q, k, v))
+    logits = jnp.einsum("bknd,bkmd->bknm", q, k, precision="highest") / q.shape[-1] ** 0.5
+    return jnp.einsum("bknm,bkmd->bknd", jax.nn.softmax(logits, -1), v, precision="highest")
+
+
+def check_against_the_reference(attend, arrays, exact=reference):
+    """Compare results and gradients: to 1e-5 of the largest value, to 2e-3 in bfloat16."""
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=arrays[0].shape), arrays[0].dtype)
+
+    def total(attend):
+        def function(*x):
+            out = attend(*x)
+            return (out.astype(jnp.float32) * weight).sum(), out
+
+        return jax.jit(jax.value_and_grad(function, (0, 1, 2), has_aux=True))(*arrays)
+
+    (_, got), slopes = total(attend)
+    (_, want), right = total(exact)
+    assert got.dtype == arrays[0].dtype
+    most = 1e-5 if got.dtype == jnp.float32 else 2e-3
+    for one, other in ((got, want), *zip(slopes, right, strict=True)):
+        error = np.asarray(one, np.float32) - np.asarray(other, np.float32)
+        largest = np.abs(np.asarray(other, np.float32)).max()
+        # The rounding of a single result to bfloat16 is up to 4e-3 of it.
+        assert np.sqrt(np.square(error).mean()) <= most * largest
+        assert np.abs(error).max() <= 5 * most * largest
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+@pytest.mark.parametrize("logits", [2**20, 300, 100])
+def test_attention_on_a_cpu_equals_the_reference_with_padding(monkeypatch, logits, dtype):
     monkeypatch.setattr(blocked_attention, "LOGITS", logits)
-    weight = jnp.asarray(np.random.default_rng(1).normal(size=v.shape[:2] + q.shape[2:]))
+    real = np.array([0, 1, 3, 4, 6, 7, 10])
 
-    def slopes(attend):
-        return jax.jit(jax.grad(lambda *x: (attend(*x) * weight).sum(), (0, 1, 2)))(q, k, v)
+    def exact(q, k, v):
+        return reference(q, k[:, :, real], v[:, :, real])
 
-    for got, want in zip(
-        slopes(blocked_attention.attention), slopes(blocked_attention.plain_attention), strict=True
-    ):
-        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+    def padded(q, k, v):
+        return blocked_attention.attention(q, k, v, real_M=real)
+
+    arrays = [x.astype(dtype) / 2 for x in inputs()]
+    check_against_the_reference(padded, arrays, exact)
+    check_against_the_reference(blocked_attention.attention, arrays)
 
 
 def test_elsewhere_the_same_formula_runs_without_loops():
@@ -176,24 +208,16 @@ def test_mapping_over_some_arrays_changes_neither_results_nor_gradients(axes):
         np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.slow(but=("9-9", "10-9"))
+@pytest.mark.slow(but=("9-9-float32", "10-9-bfloat16"))
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
 @pytest.mark.parametrize(("queries", "keys"), ODD)
-def test_padding_for_odd_lengths_changes_neither_results_nor_gradients(queries, keys):
-    q, k, v = inputs(queries=queries, keys=keys)
-    weight = jnp.asarray(np.random.default_rng(1).normal(size=q.shape))
-
+def test_padding_for_odd_lengths_changes_neither_results_nor_gradients(queries, keys, dtype):
     def padded(q, k, v):
         swapped = (x.swapaxes(1, 2) for x in (q, k, v))
         return blocked_attention.flash(*swapped, "xla").swapaxes(1, 2)
 
-    def slopes(attend):
-        return jax.grad(lambda *x: (attend(*x) * weight).sum(), (0, 1, 2))(q, k, v)
-
-    np.testing.assert_allclose(
-        padded(q, k, v), blocked_attention.plain_attention(q, k, v), rtol=1e-5, atol=1e-5
-    )
-    for got, want in zip(slopes(padded), slopes(blocked_attention.plain_attention), strict=True):
-        np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-5)
+    arrays = [x.astype(dtype) / 2 for x in inputs(queries=queries, keys=keys)]
+    check_against_the_reference(padded, arrays)
 
 
 def test_the_nine_frames_of_svd_are_traced_for_a_gpu_with_gradients(has_cudnn):
@@ -275,13 +299,6 @@ def test_a_program_for_tpus_is_traced_and_lowered_on_any_host():
     assert text.count("custom_call @tpu_custom_call") == 3, "forward, queries, keys with values"
 
 
-def reference(q, k, v):
-    """Attention in NumPy's order of operations, in float32."""
-    q, k, v = (x.astype(jnp.float32) for x in (q, k, v))
-    logits = jnp.einsum("bknd,bkmd->bknm", q, k, precision="highest") / q.shape[-1] ** 0.5
-    return jnp.einsum("bknm,bkmd->bknd", jax.nn.softmax(logits, -1), v, precision="highest")
-
-
 IN_SPLASH = [(128, 128, 128), (13, 11, 8), (130, 257, 64), (300, 384, 80), (257, 16, 64)]
 
 
@@ -290,26 +307,8 @@ IN_SPLASH = [(128, 128, 128), (13, 11, 8), (130, 257, 64), (300, 384, 80), (257,
 @pytest.mark.parametrize(("queries", "keys", "channels"), IN_SPLASH)
 def test_splash_attention_equals_the_reference_forward_and_backward(queries, keys, channels, dtype):
     # Queries and keys of variance 1, as after their normalisation in the networks.
-    q, k, v = (x.astype(dtype) / 2 for x in inputs(2, 2, queries, keys, channels))
-    weight = jnp.asarray(np.random.default_rng(1).normal(size=q.shape), dtype)
-
-    def total(attend):
-        def function(*x):
-            out = attend(*x)
-            return (out.astype(jnp.float32) * weight).sum(), out
-
-        return jax.jit(jax.value_and_grad(function, (0, 1, 2), has_aux=True))(q, k, v)
-
-    (_, got), slopes = total(functools.partial(blocked_attention.splash, interpret=True))
-    (_, want), exact = total(reference)
-    assert got.dtype == dtype
-    most = 1e-5 if dtype == jnp.float32 else 2e-3
-    for one, other in ((got, want), *zip(slopes, exact, strict=True)):
-        error = np.asarray(one, np.float32) - np.asarray(other, np.float32)
-        largest = np.abs(np.asarray(other, np.float32)).max()
-        # The rounding of a single result to bfloat16 is up to 4e-3 of it.
-        assert np.sqrt(np.square(error).mean()) <= most * largest
-        assert np.abs(error).max() <= 5 * most * largest
+    arrays = [x.astype(dtype) / 2 for x in inputs(2, 2, queries, keys, channels)]
+    check_against_the_reference(functools.partial(blocked_attention.splash, interpret=True), arrays)
 
 
 def test_tiles_waste_little():
