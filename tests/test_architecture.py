@@ -270,6 +270,5 @@ def test_one_file_asks_for_the_hardware_of_this_process():
     assert [place for place, path in PLACES.items() if asked.search(path.read_text())] == [
         "nn/target"
     ]
-    assert not [
-        path for path in (ROOT / "benchmarks").glob("*.py") if asked.search(path.read_text())
-    ]
+    benchmarks = (ROOT / "benchmarks").glob("*.py")
+    assert not [path for path in benchmarks if "default_backend" in path.read_text()]
