@@ -43,7 +43,7 @@ _TARGET = re.compile(r'custom_call_target="([^"]+)"')
 _FUSION = re.compile(r'"fusion_backend_config":\{"kind":"_*([\w$]+)"')
 _SPLASH = re.compile(r"splash_\w+")
 _CONTINUED = re.compile(r'"flag_start":"(?!-1")')
-_SLICES_SUM = re.compile(
+_BETWEEN_SLICES = re.compile(
     r'megascale_target="\{([\d,]+)\}x\{(\d+)(?::(\d+))?\}",_xla_megascale_transfer_type="(\w+)"'
 )
 _KERNEL = re.compile(r"dim_labels=\w+_(\w+)->")
@@ -272,7 +272,7 @@ def _between_slices(send: Line) -> tuple[str, tuple[int, ...]]:
     Its target, such as ``{1,2}x{0:3}``, lists slices from 1 and the devices of a slice, each of
     which communicates with those of the same number in the other slices.
     """
-    found = _SLICES_SUM.search(send.rest)
+    found = _BETWEEN_SLICES.search(send.rest)
     if found is None:
         return "", ()
     first = int(found[2])

@@ -162,7 +162,7 @@ def _ask(
     }
     with tempfile.TemporaryDirectory(prefix="pewm-plan-") as folder:
         asked, answered = Path(folder) / "request.json", Path(folder) / "report.json"
-        asked.write_text(json.dumps(request))
+        asked.write_text(json.dumps({**request, "folder": folder}))
         here = str(Path(__file__).parents[2])
         path = os.pathsep.join(filter(None, (here, os.environ.get("PYTHONPATH", ""))))
         done = subprocess.run(  # noqa: S603 - this library's own module
@@ -201,9 +201,9 @@ def _plugins(config: Any) -> list[tuple[str, str]]:
 
 
 def main(asked: str, answered: str) -> None:
-    """Answer a request of ``_ask``: read its file and write the report's, in the same folder."""
+    """Answer a request of ``_ask``: read its file and write the report's."""
     request = json.loads(Path(asked).read_text())
-    watched = request["parent"], Path(asked).parent
+    watched = request["parent"], Path(request["folder"])
     threading.Thread(target=_exit_after, args=watched, daemon=True).start()
     try:
         for name, file in request["plugins"]:

@@ -427,13 +427,14 @@ def test_a_compilation_ends_with_the_process_that_asked_for_it_and_leaves_no_fil
     assert not folder.exists()
 
 
-def test_a_failure_of_the_process_is_reported_with_its_reason(tmp_path, capsys):
+def test_a_failure_of_the_process_is_reported_with_its_reason(tmp_path):
     asked, answered = tmp_path / "request.json", tmp_path / "report.json"
     config = serialize.to_dict(presets.load("tiny"))
     request = {"plugins": [], "config": config, "kind": "stage", "name": "stage9", "chip": "v5e"}
-    more = {"devices": 1, "slices": 1, "parent": os.getppid()}
+    more = {"devices": 1, "slices": 1, "parent": os.getpid(), "folder": str(tmp_path)}
     asked.write_text(json.dumps({**request, **more}))
-    target_compiler.main(str(asked), str(answered))
+    command = [sys.executable, "-m", "pewm_jax.plan.target_compiler", str(asked), str(answered)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     error = json.loads(answered.read_text())["error"]
     assert error.startswith("The plan of stage9 for v5e failed with ValueError: not enough values")
-    assert "Traceback" in capsys.readouterr().err
+    assert "Traceback" in done.stderr
