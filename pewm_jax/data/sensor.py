@@ -10,6 +10,7 @@ of colour. Each recording draws how large its errors are, up to the constants be
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 
 import numpy as np
 from scipy import ndimage
@@ -42,6 +43,10 @@ GAIN, BIAS = 0.08, 0.02
 GRAIN = 0.02
 """Largest deviation of the noise of colours in [0, 1]."""
 
+ERRORS = ("exposure", "grain", "noise", "edges", "range", "shift", "poses")
+"""Kinds of errors: drift of exposure, noise of colour; noise of depth, depth missing at edges and
+beyond a range, depth displaced against colour; errors of poses."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Recorded:
@@ -70,6 +75,7 @@ def record(
     rgb_THWC: np.ndarray,
     depth_THW: np.ndarray,
     pose_T44: np.ndarray,
+    errors: Collection[str] = ERRORS,
 ) -> Recorded:
     """Return frames with the errors of a recording.
 
@@ -78,22 +84,29 @@ def record(
         rgb_THWC: (T, H, W, 3) uint8 true colours.
         depth_THW: (T, H, W) true depth, metres; 0 where there is no surface.
         pose_T44: (T, 4, 4) true camera-to-world.
+        errors: kinds that it has, of ``ERRORS``; one kind is the same whatever the others are.
     """
     if rng is None:
         return Recorded(rgb_THWC, depth_THW, pose_T44)
     frames = len(pose_T44)
     colours = rgb_THWC / 255.0
     exposure_T2 = slow_noise(rng, frames, 2) * rng.uniform(0, 1, 2) * (GAIN, BIAS)
-    colours = colours * np.exp(exposure_T2[:, :1, None, None]) + exposure_T2[:, 1:, None, None]
-    colours += rng.normal(size=colours.shape) * rng.uniform(0, GRAIN)
+    if "exposure" in errors:
+        colours = colours * np.exp(exposure_T2[:, :1, None, None]) + exposure_T2[:, 1:, None, None]
+    grain = rng.normal(size=colours.shape) * rng.uniform(0, GRAIN)
+    colours += grain * ("grain" in errors)
+    depth = _measured(rng, depth_THW, errors)
+    moved = _pose_errors(rng, frames)
     return Recorded(
         np.rint(255 * np.clip(colours, 0, 1)).astype(np.uint8),
-        _measured(rng, depth_THW),
-        (pose_T44 @ _pose_errors(rng, frames)).astype(np.float32),
+        depth,
+        (pose_T44 @ moved if "poses" in errors else pose_T44).astype(np.float32),
     )
 
 
-def _measured(rng: np.random.Generator, depth_THW: np.ndarray) -> np.ndarray:
+def _measured(
+    rng: np.random.Generator, depth_THW: np.ndarray, errors: Collection[str]
+) -> np.ndarray:
     """Return depth as measured, metres, 0 where missing."""
     shape, width = depth_THW.shape, depth_THW.shape[-1]
     size = rng.uniform(0, QUADRATIC)
@@ -103,9 +116,10 @@ def _measured(rng: np.random.Generator, depth_THW: np.ndarray) -> np.ndarray:
     farthest = ndimage.maximum_filter(depth_THW, (0, 3, 3))
     nearest = ndimage.minimum_filter(depth_THW, (0, 3, 3))
     edge = farthest - nearest > EDGE * np.maximum(nearest, 1e-3)
-    lost = edge & (rng.random(shape) < rng.uniform(0, EDGE_LOST))
-    measured = np.where(lost | (depth_THW > rng.uniform(*RANGE_M)), 0, depth_THW + noise)
-    moved = np.rint(rng.uniform(-SHIFT, SHIFT, 2) * width).astype(int)
+    lost = edge & (rng.random(shape) < rng.uniform(0, EDGE_LOST)) & ("edges" in errors)
+    far = (depth_THW > rng.uniform(*RANGE_M)) & ("range" in errors)
+    measured = np.where(lost | far, 0, depth_THW + noise * ("noise" in errors))
+    moved = np.rint(rng.uniform(-SHIFT, SHIFT, 2) * width).astype(int) * ("shift" in errors)
     rows, columns = (
         np.clip(np.arange(side) - by, 0, side - 1)
         for side, by in zip(shape[1:], moved, strict=True)

@@ -57,6 +57,29 @@ def test_errors_have_the_stated_sizes_and_come_from_the_seed(walk):
     assert 0 < np.mean(holes) < 0.6
 
 
+def test_a_kind_of_error_alone_changes_only_what_it_concerns(walk):
+    pose = np.asarray(walk.world_from_camera)
+    whole = record(walk, 3)[0]
+    fields = {"exposure": "rgb_THWC", "grain": "rgb_THWC", "poses": "pose_T44"}
+    truth = sensor.record(None, walk.rgb_THWC, walk.depth_THW, pose)
+    for kind in sensor.ERRORS:
+        rng = np.random.default_rng(3)
+        made = sensor.record(rng, walk.rgb_THWC, walk.depth_THW, pose, (kind,))
+        for field in dataclasses.fields(made):
+            arrays = [getattr(one, field.name) for one in (made, truth, whole)]
+            concerned = field.name == fields.get(kind, "depth_THW")
+            assert concerned or np.array_equal(arrays[0], arrays[1])
+            if kind == "poses" and concerned:
+                np.testing.assert_array_equal(arrays[0], arrays[2])
+                assert not np.array_equal(arrays[0], arrays[1])
+    lost = [
+        sensor.record(np.random.default_rng(3), walk.rgb_THWC, walk.depth_THW, pose, kinds)
+        for kinds in (("edges",), ("range",), ("edges", "range"))
+    ]
+    holes = [one.depth_THW == 0 for one in lost]
+    np.testing.assert_array_equal(holes[0] | holes[1], holes[2])
+
+
 def test_slow_noise_has_deviation_one_and_is_correlated():
     noise = sensor.slow_noise(np.random.default_rng(0), 20000, 2)
     np.testing.assert_allclose(noise.std(0), 1, atol=0.1)
