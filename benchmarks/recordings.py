@@ -12,19 +12,25 @@ reprojection, whose settings are chosen on ``validation`` with the same errors.
 from __future__ import annotations
 
 import dataclasses
-import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import record
+import sampling
 import tyro
 
 from pewm_jax.data import sensor
-from pewm_jax.data.dataset import EpisodeSource, Manifest, write_manifest, write_shard
+from pewm_jax.data.dataset import (
+    MANIFEST,
+    EpisodeSource,
+    Manifest,
+    read_manifest,
+    write_manifest,
+    write_shard,
+)
 from pewm_jax.data.episodes import Episode, EpisodeArrays, write_episode
 from pewm_jax.errors import UserError
-from pewm_jax.eval import evaluate
 from pewm_jax.io.progress import Meter
 
 NAME = "recordings"
@@ -78,43 +84,39 @@ def write(data: Path, out: Path, kinds: tuple[str, ...], count: int) -> None:
     """Write the first ``count`` episodes of both splits with kinds of errors, if not yet there."""
     for number, split in enumerate(SPLITS):
         folder, source = out / split, EpisodeSource(data / split)
-        if (folder / "dataset.json").exists():
-            continue
-        folder.mkdir(parents=True, exist_ok=True)
         episodes = [source[index] for index in range(min(count, len(source)))]
-        shard = write_shard(
-            folder / "recorded.array_record",
-            (recorded(one, kinds, (number, index)) for index, one in enumerate(episodes)),
-        )
-        about = {"errors": list(kinds), "from": data.name}
-        write_manifest(
-            folder, Manifest(split, (shard,), about, sum(one.length for one in episodes))
-        )
+        about = {"errors": list(kinds), "from": str(data.resolve())}
+        if (folder / MANIFEST).exists():
+            there = read_manifest(folder)
+            if there.settings == about and there.records == len(episodes):
+                continue
+        frames = sum(one.length for one in episodes)
+        made = (recorded(one, kinds, (number, index)) for index, one in enumerate(episodes))
+        (folder / MANIFEST).unlink(missing_ok=True)
+        shard = write_shard(folder / "recorded.array_record", made)
+        write_manifest(folder, Manifest(split, (shard,), about, frames))
 
 
 def main(settings: Settings) -> None:
     """Evaluate all cases and print the table."""
     if unknown := [case for case in settings.cases if case not in CASES]:
         raise UserError(f"--cases has {unknown[0]!r}: use some of {', '.join(CASES)}.")
+    if settings.clips < 1:
+        raise UserError(f"--clips is {settings.clips}: score at least 1.")
     rows = []
     with Meter("recordings", len(settings.cases), "evaluations") as meter:
         for case in settings.cases:
             folder = settings.out / case
             write(settings.data, folder / "data", CASES[case], settings.clips)
-            evaluate.evaluate(
+            metrics = sampling.scored(
                 settings.run,
-                out=folder / "report",
-                log=_silent,
+                folder / "report",
                 data=folder / "data",
                 split="revisit",
                 clips=settings.clips,
-                seeds=(0,),
-                videos=1,
-                video_clips=1,
-                mirror=0,
                 fvd="off",
             )
-            rows.append(_row(case, folder / "report" / "metrics.json"))
+            rows.append(_row(case, metrics))
             print(" | ".join(rows[-1]), flush=True)
             meter.advance(1)
     head = ("errors", "PSNR", "reprojection", "difference", "LPIPS", "reprojection")
@@ -125,15 +127,15 @@ def main(settings: Settings) -> None:
         record.record(NAME, f"## Recordings\n\n{about}{record.machine('jax')}\n\n{table}")
 
 
-def _silent(line: str) -> None:
-    del line
-
-
-def _row(case: str, file: Path) -> list[str]:
+def _row(case: str, metrics: dict[str, Any]) -> list[str]:
     """Return the cells of one case, from its report's numbers."""
-    metrics = json.loads(file.read_text("utf-8"))
-    found, margin = metrics["results"], metrics["margins"]["reproject"]["seen"]["psnr"]
+    found = metrics["results"]
+    if missing := {"memory", "reproject"} - set(found):
+        raise UserError(f"the report has no scores of {missing.pop()}: use a model with a memory.")
     model, other = (found[name]["seen"] for name in ("memory", "reproject"))
+    if "lpips" not in model:
+        raise UserError("the report has no LPIPS: pip install 'pewm-jax[metrics]'.")
+    margin = metrics["margins"]["reproject"]["seen"]["psnr"]
     psnr = [f"{one['psnr']['mean']:.2f}" for one in (model, other)]
     lpips = [f"{one['lpips']['mean']:.3f}" for one in (model, other)]
     return [case, *psnr, f"{margin['mean']:+.2f} ± {margin['stderr']:.2f}", *lpips]

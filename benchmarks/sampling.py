@@ -12,7 +12,7 @@ import dataclasses
 import itertools
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import record
 import tyro
@@ -23,7 +23,6 @@ from pewm_jax.eval import evaluate, loaded_run
 from pewm_jax.io.progress import Meter
 
 NAME = "sampling"
-METRICS = "metrics.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,21 +69,16 @@ def main(settings: Settings) -> None:
                 rendered_until=rendered,
             )
             out = settings.out / f"{steps}-{highest:g}-{lowest:g}-{rendered:g}"
-            evaluate.evaluate(
+            metrics = scored(
                 settings.run,
-                out=out,
-                log=_silent,
+                out,
                 config=loaded.config.with_model(noise=changed),
                 data=settings.data or None,
                 split="validation",
                 clips=settings.clips,
-                seeds=(0,),
-                videos=1,
-                video_clips=1,
-                mirror=0,
                 fvd="on",
             )
-            rows.append(_row((steps, highest, lowest, rendered), out / METRICS))
+            rows.append(_row((steps, highest, lowest, rendered), metrics))
             print(" | ".join(rows[-1]), flush=True)
             meter.advance(1)
     head = ("steps", "σ_max", "σ_min", "kept until", "PSNR seen", "PSNR never seen", "PSNR all")
@@ -100,9 +94,22 @@ def _silent(line: str) -> None:
     del line
 
 
-def _row(combination: tuple[float, ...], file: Path) -> list[str]:
+def scored(run: str, out: Path, **changes: Any) -> dict[str, Any]:
+    """Evaluate a run with one seed and the shortest rollouts; return its report's numbers.
+
+    Args:
+        run: folder of a run, or the name of a model that ships.
+        out: folder of the report.
+        changes: other arguments of ``evaluate``.
+    """
+    short = {"seeds": (0,), "videos": 1, "video_clips": 1, "mirror": 0}
+    page = evaluate.evaluate(run, out=out, log=_silent, **short, **changes)
+    metrics: dict[str, Any] = json.loads(page.with_name("metrics.json").read_text("utf-8"))
+    return metrics
+
+
+def _row(combination: tuple[float, ...], metrics: dict[str, Any]) -> list[str]:
     """Return the cells of one combination, from its report's numbers."""
-    metrics = json.loads(file.read_text("utf-8"))
     found = metrics["results"]["memory"]
     psnr = [f"{found[mask]['psnr']['mean']:.2f}" for mask in ("seen", "unseen", "all")]
     lpips = [f"{found[mask]['lpips']['mean']:.3f}" for mask in ("seen", "unseen", "all")]

@@ -16,6 +16,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from pewm_jax.errors import UserError
+
 HFOV_DEG = 55.0, 100.0
 """Smallest and largest horizontal field of view."""
 LOWER_M = 0.4
@@ -85,7 +87,12 @@ def record(
         depth_THW: (T, H, W) true depth, metres; 0 where there is no surface.
         pose_T44: (T, 4, 4) true camera-to-world.
         errors: kinds that it has, of ``ERRORS``; one kind is the same whatever the others are.
+
+    Raises:
+        UserError: an unknown kind of error.
     """
+    if unknown := set(errors) - set(ERRORS):
+        raise UserError(f"errors has {min(unknown)!r}: use some of {', '.join(ERRORS)}.")
     if rng is None:
         return Recorded(rgb_THWC, depth_THW, pose_T44)
     frames = len(pose_T44)

@@ -1,6 +1,7 @@
 """Hand-held recordings have errors of the stated sizes, and are functions of their seed."""
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from pewm_jax.data import sensor
 from pewm_jax.data.checks import check_episode
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode, settings_of
-from pewm_jax.errors import ConfigError
+from pewm_jax.errors import ConfigError, UserError
 from tests.data import two_rooms
 
 
@@ -72,12 +73,27 @@ def test_a_kind_of_error_alone_changes_only_what_it_concerns(walk):
             if kind == "poses" and concerned:
                 np.testing.assert_array_equal(arrays[0], arrays[2])
                 assert not np.array_equal(arrays[0], arrays[1])
+    changed = dict.fromkeys(sensor.ERRORS, False)
+    # Displacements round to whole pixels: none in an image of 32.
+    rgb, depth = (x.repeat(4, 1).repeat(4, 2) for x in (walk.rgb_THWC, walk.depth_THW))
+    truth = sensor.record(None, rgb, depth, pose)
+    for kind, seed in itertools.product(sensor.ERRORS, range(6)):
+        made = sensor.record(np.random.default_rng(seed), rgb, depth, pose, (kind,))
+        name = fields.get(kind, "depth_THW")
+        changed[kind] |= not np.array_equal(getattr(made, name), getattr(truth, name))
+    assert all(changed.values())
     lost = [
         sensor.record(np.random.default_rng(3), walk.rgb_THWC, walk.depth_THW, pose, kinds)
         for kinds in (("edges",), ("range",), ("edges", "range"))
     ]
     holes = [one.depth_THW == 0 for one in lost]
     np.testing.assert_array_equal(holes[0] | holes[1], holes[2])
+
+
+def test_an_unknown_kind_of_error_is_refused(walk):
+    rng, pose = np.random.default_rng(0), np.asarray(walk.world_from_camera)
+    with pytest.raises(UserError, match="errors has 'blur': use some of exposure, grain"):
+        sensor.record(rng, walk.rgb_THWC, walk.depth_THW, pose, ("blur",))
 
 
 def test_slow_noise_has_deviation_one_and_is_correlated():
