@@ -170,12 +170,14 @@ class RecordMaker:
         if raw.pose_T44 is None:
             pose, turns = np.tile(FORWARD, (part.entry.frames, 1, 1)), 0
         else:
-            pose, turns = self._poses(np.array(raw.pose_T44, np.float64))
+            pose, turns = self._poses(np.array(raw.pose_T44, np.float64), raw.posed_from_colour_44)
         scale = None if raw.depth_scale is None else config.depth_scale or raw.depth_scale
         fit = Fit(raw.size, config.size, config.fit, turns)
         return _Opened(raw, pose, self._intrinsics(raw), fit, scale)
 
-    def _poses(self, pose: np.ndarray) -> tuple[np.ndarray, int]:
+    def _poses(
+        self, pose: np.ndarray, posed_from_colour: np.ndarray | None
+    ) -> tuple[np.ndarray, int]:
         """Return the poses in our world and convention, and the quarter turns of the images."""
         config, known = self.config, np.isfinite(pose).all((1, 2))
         pose[_lost(pose)] = np.nan
@@ -185,6 +187,8 @@ class RecordMaker:
             whole[rigid] = np.linalg.inv(whole[rigid])
         if config.camera_axes == "opengl":
             whole = whole @ OPENGL
+        if posed_from_colour is not None:
+            whole = whole @ posed_from_colour
         whole = self._world @ whole
         if config.rotate != "auto":
             turns = int(config.rotate) // 90

@@ -67,12 +67,21 @@ def matrix(path, pose):
     path.write_text("\n".join("\t".join(f"{x:.9e}" for x in row) for row in pose) + "\n")
 
 
-def seven_scenes(folder, walk, name="seq-01"):
-    for k, pose in enumerate(Y_DOWN @ walk.pose):
+def seven_scenes(folder, walk, name="seq-01", convert=lambda pose: pose):
+    """Depth and poses are those of another camera, 22 mm left, with a longer focal length.
+
+    ``convert`` changes the poses that are written.
+    """
+    aside = np.eye(4)
+    aside[0, 3] = -0.022
+    left = walk.pose @ aside
+    zoomed = np.concatenate([np.asarray(walk.focal[:2]) * 585 / 525, walk.focal[2:]])
+    _, depth = box_views(left, zoomed, *walk.depth.shape[1:])
+    for k, pose in enumerate(Y_DOWN @ left):
         start = folder / name / f"frame-{k:06d}"
         image(start.with_suffix(".color.png"), walk.rgb[k])
-        depth_image(start.with_suffix(".depth.png"), walk.depth[k], 1000)
-        matrix(start.with_suffix(".pose.txt"), pose)
+        depth_image(start.with_suffix(".depth.png"), depth[k], 1000)
+        matrix(start.with_suffix(".pose.txt"), convert(pose))
     return folder
 
 

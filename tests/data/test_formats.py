@@ -21,7 +21,7 @@ from tests.data.two_rooms import box_views
 
 FRAMES = 12
 WALKS = {
-    "7scenes": {"focal": (58.5, 58.5, 32, 24)},
+    "7scenes": {"focal": (52.5, 52.5, 32, 24)},
     "replica": {"width": 60, "height": 34, "focal": (30, 30, 30, 17)},
 }
 WRITERS = {
@@ -70,6 +70,11 @@ def test_poses_depth_and_colours_arrive_exactly(tmp_path, name):
         expected = expected.repeat(2, 1).repeat(2, 2)
         if name == "stray":
             expected[:, :4] = 0  # of the lowest confidence
+    elif name == "7scenes":  # projected from another camera: the nearest of its pixels
+        expected = np.where(seen > 0, walk.depth, 0)
+        assert 0.75 < (seen > 0).mean() < 0.85  # it sees less: (525 / 585)²
+        assert np.median(np.abs(seen - expected)[seen > 0]) < 0.005
+        expected = seen
     elif name == "lerobot":
         expected = layouts.dequantize(layouts.quantize(walk.depth))
     else:

@@ -16,7 +16,7 @@ from pewm_jax.data.import_files import PIXELS, plan
 from pewm_jax.data.importer import ImportConfig, import_recording
 from tests.data import layouts
 
-FOCAL = (58.5, 58.5, 32, 24)
+FOCAL = (52.5, 52.5, 32, 24)
 
 
 @pytest.fixture(scope="module")

@@ -38,12 +38,9 @@ def test_right_poses_have_a_small_error_and_a_picture(tmp_path):
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_convention_is_named_and_its_option_mends_it(tmp_path, name):
-    walk = layouts.hand_held(24, focal=(58.5, 58.5, 32, 24))
+    walk = layouts.hand_held(24, focal=(52.5, 52.5, 32, 24))
     convert, options = WRONG[name]
-    other = layouts.Walk(walk.rgb, walk.depth, walk.pose.copy(), walk.focal)
-    world = np.linalg.inv(layouts.Y_DOWN)
-    other.pose = np.stack([world @ convert(layouts.Y_DOWN @ pose) for pose in walk.pose])
-    src, lines = layouts.seven_scenes(tmp_path / "src", other), []
+    src, lines = layouts.seven_scenes(tmp_path / "src", walk, convert=convert), []
     with pytest.raises(UserError, match="disagrees with the poses"):
         import_recording(
             ImportConfig(src, tmp_path / "out", format="7scenes", check=True), lines.append

@@ -69,6 +69,8 @@ class RawSequence:
         voxels: returns the grids of some frames in a world that was turned by a (4, 4) matrix.
         info: facts about the episode that the format knows.
         note: a sentence for the user about what was taken from where.
+        posed_from_colour_44: pose of the colour camera in the frame of the camera that ``pose_T44``
+            is of, OpenCV axes; None if it is the same camera.
     """
 
     pose_T44: np.ndarray | None
@@ -84,6 +86,7 @@ class RawSequence:
     voxels: Callable[[Sequence[int], np.ndarray], Any] | None = None
     info: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     note: str = ""
+    posed_from_colour_44: np.ndarray | None = None
 
 
 @dataclasses.dataclass(frozen=True)
