@@ -15,7 +15,8 @@ def config() -> Config:
 
     Its data: ``pewm-jax data collect data/small2 --train 4000 --frames 72 --handheld 0.3``. The
     observed frame is rendered from each camera, and 30 % of the rendered memories have errors,
-    as those of real recordings have. Batches are small and of few frames: many steps learn faster.
+    as those of real recordings have. Surfels are finer than those of ``small``, for surfaces nearer
+    than those of generated houses. Batches are small and of few frames: many steps learn faster.
     ``docs/trials.md`` has its scores: with so few steps it is behind ``small`` where a memory
     exists. A step takes 0.4 to 0.9 s on two CPU cores. The gate is trained on clips that the model
     imagines, with LPIPS in its loss (``pip install 'pewm-jax[metrics]'``).
@@ -28,7 +29,13 @@ def config() -> Config:
             clip=base.clip,
             codec=PixelConfig(spatial=4, temporal=1, gate=48),
             backbone=UViTBackbone(layers=6, heads=6, head_dim=32),
-            memory=dataclasses.replace(base.memory, reader=reader),
+            memory=dataclasses.replace(
+                base.memory,
+                reader=reader,
+                cell_m=(0.02, 0.02, 0.02),
+                cells=(1280, 1280, 256),
+                keep="newest",
+            ),
             noise=dataclasses.replace(egowm.NOISE, sample_steps=6),
             observed="warped",
         ),
