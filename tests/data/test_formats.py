@@ -14,6 +14,7 @@ import pytest
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.data import formats
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.formats import seven_scenes
 from pewm_jax.data.formats.lerobot_features import Features
 from pewm_jax.data.importer import ImportConfig, import_recording
 from tests.data import layouts
@@ -71,15 +72,23 @@ def test_poses_depth_and_colours_arrive_exactly(tmp_path, name):
         if name == "stray":
             expected[:, :4] = 0  # of the lowest confidence
     elif name == "7scenes":  # projected from another camera: the nearest of its pixels
-        expected = np.where(seen > 0, walk.depth, 0)
         assert 0.75 < (seen > 0).mean() < 0.85  # it sees less: (525 / 585)²
-        assert np.median(np.abs(seen - expected)[seen > 0]) < 0.005
-        expected = seen
+        assert np.median(np.abs(seen - walk.depth)[seen > 0]) < 0.005
+        return
     elif name == "lerobot":
         expected = layouts.dequantize(layouts.quantize(walk.depth))
     else:
         expected = np.rint(walk.depth * scale) / scale
     np.testing.assert_allclose(seen, expected, atol=1e-4)
+
+
+def test_depth_in_other_units_is_displaced_as_far():
+    depth = np.full((48, 64), 1500, np.uint16)
+    depth[10:20, 30:40] = 900
+    found = seven_scenes.to_colours(depth)
+    np.testing.assert_array_equal(seven_scenes.to_colours(5 * depth, 5000.0), 5 * found)
+    near = np.nonzero(found == 900)[1]
+    assert (near.min(), near.max()) == (29, 37)  # 30 and 38 without a parallax of 1.28 pixels
 
 
 def test_a_robot_without_depth_arrives_with_its_motion(tmp_path):

@@ -36,6 +36,8 @@ DEPTH_FOCAL, COLOUR_FOCAL, WIDTH = 585.0, 525.0, 640
 """Focal lengths of the two cameras, and the width of the published images, pixels."""
 BESIDE_M = 0.022
 """Metres from the depth camera to the colour camera, to the right."""
+PER_METRE = 1000.0
+"""Stored depth of one metre."""
 UNMEASURED = 65535
 """Stored depth of a pixel without a measurement, beside 0."""
 COLOURS = "color.png", "color.jpg"
@@ -59,11 +61,11 @@ class SevenScenes(FolderFormat):
 
     def entry(self, folder: Path, options: ImportConfig) -> Entry:
         """Return the sequence of one folder."""
-        del options
         colours = self.found(folder).removeprefix("frame-*.") or COLOURS[0]
         kinds = (colours, "colour images"), ("depth.png", "depth images"), ("pose.txt", "poses")
         files = PosedFiles(*(Files(what, folder, "frame-", f".{end}") for end, what in kinds))
-        return Entry(folder.name, len(files.numbers), lambda: _registered(files))
+        per_metre = options.depth_scale or PER_METRE
+        return Entry(folder.name, len(files.numbers), lambda: _registered(files, per_metre))
 
 
 def _intrinsics(size: tuple[int, int]) -> np.ndarray:
@@ -72,7 +74,7 @@ def _intrinsics(size: tuple[int, int]) -> np.ndarray:
     return np.array([focal, focal, size[0] / 2, size[1] / 2])
 
 
-def _registered(files: PosedFiles) -> RawSequence:
+def _registered(files: PosedFiles, per_metre: float) -> RawSequence:
     """Return the sequence with depth as the colour camera would see it."""
     raw = files.open(None, _intrinsics)
     depth_from_colour = np.eye(4)
@@ -81,7 +83,7 @@ def _registered(files: PosedFiles) -> RawSequence:
     def load(of_both: Load) -> Picture:
         picture = of_both()
         assert picture.depth_HW is not None
-        return dataclasses.replace(picture, depth_HW=to_colours(picture.depth_HW))
+        return dataclasses.replace(picture, depth_HW=to_colours(picture.depth_HW, per_metre))
 
     def read(chosen: Sequence[int]) -> Iterator[Load]:
         return (functools.partial(load, of_both) for of_both in raw.read(chosen))
@@ -95,11 +97,11 @@ def _registered(files: PosedFiles) -> RawSequence:
     )
 
 
-def to_colours(depth_HW: np.ndarray) -> np.ndarray:
+def to_colours(depth_HW: np.ndarray, per_metre: float = PER_METRE) -> np.ndarray:
     """Return the depth that the colour camera would see, 0 where it is not measured.
 
-    Both images have the same size; of several pixels that fall on one the nearest counts. Depth is
-    in millimetres.
+    Both images have the same size; of several pixels that fall on one the nearest counts.
+    ``per_metre`` is the stored depth of one metre.
     """
     high, wide = depth_HW.shape
     rows, columns = np.nonzero((depth_HW > 0) & (depth_HW < UNMEASURED))
@@ -107,7 +109,7 @@ def to_colours(depth_HW: np.ndarray) -> np.ndarray:
     far_first = np.argsort(depth, kind="stable")[::-1]
     rows, columns, depth = rows[far_first], columns[far_first], depth[far_first]
     smaller = COLOUR_FOCAL / DEPTH_FOCAL
-    parallax = BESIDE_M * COLOUR_FOCAL * wide / WIDTH / (depth / 1000)
+    parallax = BESIDE_M * COLOUR_FOCAL * wide / WIDTH / (depth / per_metre)
     x = np.floor((columns + 0.5 - wide / 2) * smaller - parallax + wide / 2).astype(int)
     y = np.floor((rows + 0.5 - high / 2) * smaller + high / 2).astype(int)
     inside = (x >= 0) & (x < wide) & (y >= 0) & (y < high)
