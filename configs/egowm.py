@@ -22,23 +22,24 @@ def config() -> Config:
     """Return the settings of ``egowm``.
 
     Pixels are denoised by a U-ViT, without an autoencoder, whose errors would count in LPIPS. The
-    observed frame conditions every frame: the world has no memory, and what is not in the present
-    frame has to be imagined. Batches are small: many steps learn faster. Steps and turns are small,
-    so that what is observed stays in view for a while. Its data:
-    ``pewm-jax data collect data/ego --train 2000 --validation 32 --test 48 --frames 72 --step_m
-    0.12 --turn_deg 10 --turn_around 0 --test_policy follow --ids``. Test scenes are walked, since
-    revisits with turns of 10 degrees consist of turns on the spot. The report imagines two chunks,
-    16 frames.
+    observed frame conditions every frame, rendered by its depth from the camera to which the
+    actions lead: the world has no memory, and what the present frame does not show has to be
+    imagined. LPIPS of denoised frames is part of the loss (``pip install 'pewm-jax[metrics]'``).
+    Batches are small: many steps learn faster. Steps and turns are small, so that what is observed
+    stays in view for a while. Its data: ``pewm-jax data collect data/ego --train 1600 --validation
+    16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10 --turn_around 0 --test_policy follow
+    --ids``. Test scenes are walked, since revisits with turns of 10 degrees consist of turns on the
+    spot. The report imagines two chunks, 16 frames.
     """
     return Config(
         model=EgoWM(
-            clip=ClipConfig(height=64, width=64, depth=False),
+            clip=ClipConfig(height=64, width=64),
             codec=PixelConfig(spatial=4, temporal=1),
             backbone=UViTBackbone(layers=6, heads=6, head_dim=32),
             actions=ActionConfig(step_m=0.12, turn_deg=10.0),
             control=ModulationConfig(units=(0.12, 0.12, 1.0)),
             noise=NOISE,
-            observed="every",
+            observed="warped",
         ),
         data=DataConfig(
             path="data/ego",
@@ -51,7 +52,9 @@ def config() -> Config:
         train=EgoWMTrainConfig(
             run="runs/egowm",
             optimizer="muon",
-            adapt=StageConfig(steps=16000, batch=4, learning_rate=3e-3, warmup=100),
+            adapt=StageConfig(steps=2200, batch=3, learning_rate=3e-3, warmup=100),
+            denoised_lpips=0.3,
+            denoised_lpips_weights="equal",
             ema=0.999,
             preview_every=0,
         ),

@@ -13,9 +13,10 @@ def config() -> Config:
 
     They are those of ``egowm`` with another control: actions are the angles of the joints at the
     next frame with the linear and the angular velocity, and the initial state is a further input
-    (Eq. 6). Its data: ``pewm-jax data collect data/humanoid --body humanoid --train 2000
-    --validation 32 --test 48 --frames 72 --step_m 0.12 --turn_deg 10 --turn_around 0 --test_policy
-    follow --ids``.
+    (Eq. 6). There is no depth, and the observed frame conditions every frame as it is, since the
+    arms move against the room. Its data: ``pewm-jax data collect data/humanoid --body humanoid
+    --train 1600 --validation 16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10 --turn_around 0
+    --test_policy follow --ids``.
     """
     base, size = egowm.config(), HUMANOID.size
     control = ModulationConfig(
@@ -29,7 +30,12 @@ def config() -> Config:
     )
     return dataclasses.replace(
         base,
-        model=dataclasses.replace(base.model, control=control),
+        model=dataclasses.replace(
+            base.model,
+            clip=dataclasses.replace(base.model.clip, depth=False),
+            control=control,
+            observed="every",
+        ),
         data=dataclasses.replace(
             base.data, path="data/humanoid", prepared_path="data/humanoid_prepared"
         ),

@@ -50,10 +50,10 @@ def tiny_model(**sections) -> PEWM:
 
 
 def shrink(model, frames=3, side=16):
-    """Return a world model without depth of one tiny block, on pixels, with one sampling step."""
+    """Return a world model of one tiny block, on pixels, with one sampling step."""
     return dataclasses.replace(
         model,
-        clip=ClipConfig(frames=frames, height=side, width=side, depth=False),
+        clip=dataclasses.replace(model.clip, frames=frames, height=side, width=side),
         codec=PixelConfig(temporal=1),
         backbone=DiTBackbone(
             layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16

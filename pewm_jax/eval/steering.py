@@ -3,7 +3,8 @@
 A world that follows its actions is closest to the ground truth with the true ones. *Shuffled*
 actions are those of a clip in another house. *None* are zero embeddings, as observed frames have:
 available only for models whose control can be zeroed. *Copy* is a baseline without a network that
-repeats the observed frame. ``walks`` chooses the clips.
+repeats the observed frame; *warp*, for worlds that get it warped, shows it by its depth from the
+camera to which the actions lead, holes filled from the nearest pixel. ``walks`` chooses the clips.
 
 Every kind of actions is scored by the squared error of colours and, where they can be measured, by
 LPIPS, by SCS with exact masks of the true clip, and by the IoU of the agent's arms with the truth.
@@ -22,7 +23,8 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.bodies.humanoid import arm_ids
-from pewm_jax.config import Config, UserError
+from pewm_jax.codecs.signals import as_signal
+from pewm_jax.config import AssembledModel, Config, UserError
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import statistics
 from pewm_jax.eval.clips import ClipChoice, load_clip, stack
@@ -35,10 +37,12 @@ from pewm_jax.eval.scoring import Tracked, tracked_of
 from pewm_jax.eval.walks import Walks, choose_walks
 from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import ResultCache, map_resumable
+from pewm_jax.memory import rendering
 from pewm_jax.report.labels import PUBLISHED_FRAMES
 from pewm_jax.types import Array, Control, Frames, Params
+from pewm_jax.worlds.control import control_of
 
-TRUE, SHUFFLED, NONE, COPY, TRUTH = "true", "shuffled", "none", "copy", "truth"
+TRUE, SHUFFLED, NONE, COPY, WARP, TRUTH = "true", "shuffled", "none", "copy", "warp", "truth"
 """Kinds of actions; ``truth`` is the true clip, the ceiling of scores that need a segmentation."""
 SMALLER = ("lpips",)
 """Scores of which smaller values are better."""
@@ -247,6 +251,7 @@ class _Pieces:
         self._silent = _with_zero_actions(config, params)
         self._imagine = jax.jit(_imagined, static_argnums=0)
         kinds = (TRUE, SHUFFLED, *([NONE] if self._silent is not None else []), COPY)
+        kinds += (WARP,) if _warps(config) else ()
         kinds += (TRUTH,) if measures.structure is not None or measures.arms else ()
         starts = range(0, len(walks.choices), self.size)
         self.keys = [(kind, first) for first in starts for kind in kinds]
@@ -266,9 +271,12 @@ class _Pieces:
                 others = self.walks.others[first : first + self.size]
                 pairs = zip(controls, others, strict=True)
                 given = [_with_actions(one, self._load(other)[2]) for one, other in pairs]
-            weights = self._silent if kind == NONE else self.params
             numbers, padded = np.arange(first, first + self.size), stack(given, self.size)
-            rgb = self._imagine(self.config, weights, context, padded, self.seed, numbers)
+            if kind == WARP:
+                rgb = _warped(self.config, context, padded)
+            else:
+                weights = self._silent if kind == NONE else self.params
+                rgb = self._imagine(self.config, weights, context, padded, self.seed, numbers)
         off = jnp.square(unit_colours(rgb) - unit_colours(truth.rgb_THWC))
         found = {"errors": np.asarray(off.mean((2, 3, 4)))[:count]}
         if self.measures.lpips is not None and kind != TRUTH:
@@ -343,8 +351,31 @@ def _imagined(
     return jax.vmap(one)(context, control, numbers_B)
 
 
+def _warps(config: Config) -> bool:
+    return isinstance(config.model, AssembledModel) and config.model.observed == "warped"
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _warped(config: Config, context: Frames, control: Any) -> Array:
+    """Return (B, N, H, W, 3) colours in [−1, 1] of the observed frame, warped without a network."""
+    clip = config.model.clip
+
+    def one(given: tuple[Frames, Any]) -> Array:
+        context, control = given
+        present = jax.tree.map(lambda x: x[-1:], as_signal(context))
+        camera = control_of(config.model, present.camera, control).camera
+        view = rendering.splat_frames(present, camera, clip.height, clip.width)
+        return rendering.fill_nearest(view).features_THWF[..., :3]
+
+    return jax.lax.map(one, (context, control))
+
+
 def _with_zero_actions(config: Config, params: Params) -> Params | None:
-    """Return weights whose control embeds every action as zero, or None if there are none."""
-    if not config.model.capabilities.silent_actions or "control" not in params:
+    """Return weights whose control embeds every action as zero, or None if there are none.
+
+    A warped observed frame follows the actions as well.
+    """
+    silent = config.model.capabilities.silent_actions and not _warps(config)
+    if not silent or "control" not in params:
         return None
     return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

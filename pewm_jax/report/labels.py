@@ -59,9 +59,11 @@ ACTIONS_NAMES = {
     "shuffled": "another clip's actions",
     "none": "no actions",
     "copy": "the observed frame, repeated",
+    "warp": "the observed frame, warped",
     "true - shuffled": "true minus another clip's",
     "true - none": "true minus none",
     "true - copy": "true minus the observed frame",
+    "true - warp": "true minus the warped frame",
 }
 """Labels of the kinds of actions given to a model, and of their differences."""
 TRUTH_NAME = "the true clip"
@@ -265,14 +267,18 @@ def compare_steering(found: Mapping[str, Any]) -> list[str]:
     """
     lines, scores = [], found.get("scores", {})
     if "lpips" in scores:
-        each = (scores["lpips"]["per_frame"][kind]["mean"] for kind in ("true", "copy"))
-        pairs = dict(enumerate(zip(*each, strict=True), 1))
-        said = [
-            f"{true:.3f} against {copy:.3f} ({100 * (true / copy - 1):+.1f} %) at frame {t}"
-            for t, (true, copy) in pairs.items()
-            if t in PUBLISHED_FRAMES and None not in (true, copy) and copy > 0
-        ]
-        lines += [f"LPIPS, true actions against copying: {'; '.join(said)}."] * bool(said)
+        found_by_kind = scores["lpips"]["per_frame"]
+        for kind, title in (("copy", "copying"), ("warp", "warping")):
+            if kind not in found_by_kind:
+                continue
+            each = (found_by_kind[name]["mean"] for name in ("true", kind))
+            pairs = dict(enumerate(zip(*each, strict=True), 1))
+            said = [
+                f"{true:.3f} against {base:.3f} ({100 * (true / base - 1):+.1f} %) at frame {t}"
+                for t, (true, base) in pairs.items()
+                if t in PUBLISHED_FRAMES and None not in (true, base) and base > 0
+            ]
+            lines += [f"LPIPS, true actions against {title}: {'; '.join(said)}."] * bool(said)
     for name, title in (("scs", "SCS"), ("arms", "IoU of the arms")):
         whole = scores.get(name, {}).get("all", {})
         true, other = (whole.get(kind, {}).get("mean") for kind in ("true", "shuffled"))

@@ -3,7 +3,9 @@
 Rows: the actions added to the time embedding (the paper), as further tokens that the network
 attends to, as further input channels, and a model that was trained without actions; beside them the
 observed frame, repeated. Every row has the same codec, network, data, seed and clips. Each gets as
-many steps as its time allows (``step_times``). Trained rows and scores are stored, so that the same
+many steps as its time allows (``step_times``). A warped observed frame would tell every row how the
+agent moves, so all get it as it is instead (``model.observed every``); LPIPS is not in their loss,
+since the stage without actions cannot have it. Trained rows and scores are stored, so that the same
 command resumes.
 """
 
@@ -103,14 +105,16 @@ class Study:
         trained = dataclasses.replace(train.adapt, steps=steps)
         skipped = dataclasses.replace(train.adapt, steps=0)
         stages = (trained, skipped) if name == "none" else (skipped, trained)
+        observed = "every" if base.model.observed == "warped" else base.model.observed
         return dataclasses.replace(
-            base.with_model(control=control),
+            base.with_model(control=control, observed=observed),
             train=dataclasses.replace(
                 train,
                 run=str(self.folder(name, seed)),
                 seed=seed,
                 video=stages[0],
                 adapt=stages[1],
+                denoised_lpips=0.0,
                 preview_every=0,
             ),
         )

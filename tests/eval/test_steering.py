@@ -17,7 +17,7 @@ from pewm_jax.io.store import ResultCache
 from pewm_jax.report import evaluation_page
 from pewm_jax.report.labels import ACTIONS_NAMES, format_steering
 from pewm_jax.report.page import render
-from pewm_jax.types import Frames
+from pewm_jax.types import Camera, Frames
 from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
 from tests.helpers import tiny_config
 
@@ -68,7 +68,7 @@ def test_true_actions_are_compared_with_those_of_another_house_with_none_and_wit
     table = found.table()
     assert table["true - shuffled"]["houses"] == 3
     assert table["true - shuffled"]["low"] > 0
-    assert len(found.lines()) == 2 + len(ACTIONS_NAMES)
+    assert len(found.lines()) == 2 + len(ACTIONS_NAMES) - 2  # without warping
     assert "75.0 % of the steps go forward" in found.lines()[0]
 
 
@@ -87,7 +87,7 @@ def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, 
     assert len(said) == 1
     metrics = {"steering": found.facts(), "protocol": {"steering": about}}
     page = render("", [], [evaluation_page.steering(metrics)])
-    assert page.count("<tr") == 1 + len(ACTIONS_NAMES)
+    assert page.count("<tr") == 1 + len(ACTIONS_NAMES) - 2
     assert f"{found.psnr['true'].mean():.2f} [" in page
     assert "75 % of their steps go forward" in page
     (sentence,) = format_steering(metrics)
@@ -108,6 +108,38 @@ def test_what_was_not_measured_is_said(obeying, monkeypatch, tmp_path):
     assert format_steering(metrics) == [about]
     assert about.startswith("Steering is not measured: no episode of")
     assert format_steering({"steering": None, "protocol": {"steering": None}}) == []
+
+
+def test_a_world_that_warps_its_observed_frame_is_compared_with_warping_alone(monkeypatch):
+    """A wall seen by one camera, which steps and turns: warping shows it where the truth does."""
+    clip = dataclasses.replace(CONFIG.model.clip, height=16, width=16)
+    model = dataclasses.replace(CONFIG.model, clip=clip, observed="warped")
+    config = dataclasses.replace(CONFIG, model=model)
+    move = np.array([[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]], np.float32)  # half a metre to the left
+    intrinsics = np.full((1, 4), 8.0, np.float32)
+
+    def load_clip(config, episodes, choice):
+        poses = np.asarray(integrate(pose_from_yaw(np.zeros(3), 0.0), move))
+        stripes = np.tile(np.arange(16, dtype=np.float32)[None, :, None] / 16, (16, 1, 3))
+        depth = np.full((1, 16, 16), 2.0, np.float32)
+        present = Frames(stripes[None], depth, Camera(intrinsics, poses[:1]))
+        moved = stripes[:, (np.arange(16) - 2).clip(0)]  # by 8 pixels · 0.5 m / 2 m
+        truth = dataclasses.replace(present, rgb_THWC=np.stack([stripes, moved]))
+        return present, truth, move
+
+    def imagined(config, params, context, control, seed, numbers):
+        return jnp.full((len(control), 2, 16, 16, 3), 0.5)
+
+    monkeypatch.setattr(steering, "load_clip", load_clip)
+    monkeypatch.setattr(steering, "_imagined", imagined)
+    clips = [types.SimpleNamespace(start=k, scene=s, episode=k) for k, s in enumerate("ab")]
+    walks = Walks(clips, clips[::-1], np.full(2, 0.75), np.full(2, 0.75))
+    monkeypatch.setattr(steering, "choose_walks", lambda *_: walks)
+    found = steering.measure(config, PARAMS, [], 2)
+    assert set(found.psnr) == {"true", "shuffled", "copy", "warp"}
+    np.testing.assert_allclose(found.errors["copy"][:, 0], 0, atol=1e-6)
+    assert (found.errors["copy"][:, 1] > 0.003).all()
+    np.testing.assert_allclose(found.errors["warp"], 0, atol=1e-4)
 
 
 def test_a_world_without_embeddings_of_actions_is_not_asked_for_none(obeying):

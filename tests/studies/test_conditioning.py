@@ -46,6 +46,8 @@ def test_every_row_gives_its_actions_in_its_way_and_trains_one_stage():
         assert study.stage(name).settings(config).steps == 70
         assert config.model.control.inject == ("timestep" if name == "none" else name)
         assert config.model.backbone == base().model.backbone
+        assert (config.model.observed, config.train.denoised_lpips) == ("every", 0)
+    assert base().model.observed == "warped"
 
 
 def test_rows_get_as_many_steps_as_their_time_allows_and_it_is_measured_once(tmp_path, monkeypatch):
