@@ -132,6 +132,20 @@ def everywhere(
     return jnp.concatenate([_seen(model, latents), mask], -1)
 
 
+def splatted(model: AssembledModel, observed: Frames, camera: Camera) -> View:
+    """Render the pixels of (B, S) observed frames, colours in [−1, 1], from (B, T) cameras."""
+
+    def of_batch(_: Params, observed: Frames, camera: Camera) -> View:
+        return jax.lax.map(lambda clip: _splatted(model, *clip), (observed, camera))
+
+    return placement.by_batch(of_batch, {}, *jax.tree.map(jnp.asarray, (observed, camera)))
+
+
+def _splatted(model: AssembledModel, observed: Frames, camera: Camera) -> View:
+    """Render the pixels of one clip's observed frames."""
+    return rendering.splat_frames(observed, camera, model.clip.height, model.clip.width)
+
+
 def _warped(
     model: AssembledModel, params: Params, observed: Frames, camera: Camera
 ) -> tuple[Array, Array]:
@@ -139,8 +153,7 @@ def _warped(
 
     def of_batch(weights: Params, observed: Frames, camera: Camera) -> EncodedView:
         def of_clip(clip: tuple[Frames, Camera]) -> EncodedView:
-            view = rendering.splat_frames(*clip, model.clip.height, model.clip.width)
-            return memories.encode(model, weights, view)
+            return memories.encode(model, weights, _splatted(model, *clip))
 
         return jax.lax.map(of_clip, (observed, camera))
 

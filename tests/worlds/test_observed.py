@@ -14,7 +14,7 @@ from pewm_jax import presets, worlds
 from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
-from pewm_jax.config import Config, ConfigError, TrainConfig
+from pewm_jax.config import Config, ConfigError, TrainConfig, UserError
 from pewm_jax.memory import rendering
 from pewm_jax.memory.surfels import SurfelConfig
 from pewm_jax.readers.render import RenderConfig
@@ -22,6 +22,7 @@ from pewm_jax.train import feed
 from pewm_jax.types import Camera, Control, Frames, WorldState
 from pewm_jax.worlds import objective, world_model
 from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
+from pewm_jax.worlds.stages import TRAIN
 from tests.helpers import TINY, init_world, random_camera, random_frames, random_world, tiny_model
 from tests.train.test_prepared import a_batch
 
@@ -267,6 +268,64 @@ def test_egowm_has_it_too(observed, history):
     state = worlds.start(model, params, random_frames(np.random.default_rng(0), 3))
     _, frames = worlds.imagine(model, params, state, jnp.zeros((2, 3)), KEY)
     assert np.isfinite(frames.rgb_THWC).all()
+
+
+GATED = EgoWM(
+    clip=TINY.clip,
+    codec=PixelConfig(spatial=4, temporal=1, gate=8),
+    backbone=TINY.backbone,
+    noise=TINY.noise,
+    observed="warped",
+)
+STILL = np.zeros((10, 3), np.float32)
+
+
+def test_the_gate_of_egowm_shows_the_observed_frame_chunk_after_chunk():
+    """An agent that stands still sees what it saw if its gate takes all that is rendered."""
+    params = random_world(GATED, memory=False)
+    out = jax.tree.map(jnp.zeros_like, params["codec"]["gate"]["out"])
+    frames = random_frames(np.random.default_rng(0), 1)
+    frames = dataclasses.replace(frames, depth_THW=np.full((1, 16, 24), 2.0, np.float32))
+    state = worlds.start(GATED, params, frames)
+
+    def imagined(logit):
+        bias = jnp.tile(jnp.array([logit, logit, 0.0, 0.0, 0.0, 0.0]), 4)
+        gate = {**params["codec"]["gate"], "out": {**out, "bias": bias}}
+        return worlds.imagine(GATED, {**params, "codec": {"gate": gate}}, state, STILL, KEY)[1]
+
+    taken = imagined(40.0)
+    np.testing.assert_allclose(taken.rgb_THWC, np.repeat(state.frame.rgb_THWC, 10, 0), atol=2e-3)
+    np.testing.assert_allclose(taken.depth_THW, 2.0, atol=2e-2)
+    plain = dataclasses.replace(GATED, codec=PixelConfig(spatial=4, temporal=1))
+    ungated = worlds.imagine(plain, params, state, STILL, KEY)[1]
+    np.testing.assert_allclose(imagined(-40.0).rgb_THWC[:8], ungated.rgb_THWC[:8], atol=2e-3)
+    assert np.abs(taken.rgb_THWC - ungated.rgb_THWC).max() > 0.1
+
+
+def test_the_gate_of_egowm_learns_on_imagined_clips_and_the_rest_is_frozen():
+    config = Config(model=GATED, train=EgoWMTrainConfig())
+    stage = worlds.stages(config)[2]
+    assert (stage.name, stage.optional) == ("gate", True)
+    params, clip = random_world(GATED, memory=False), a_batch(config, 2)
+    clip = dataclasses.replace(clip, actions_TA=np.zeros((2, 8, 3), np.float32))
+    ready = stage.prepare(GATED, params, clip)
+    loss = jax.jit(lambda p, c: stage.loss(GATED, config.train, p, c, KEY)[0])
+    np.testing.assert_allclose(loss(params, ready), loss(params, clip), rtol=1e-4)
+    gradient = jax.grad(loss)(params, ready)["codec"]["gate"]
+    better = {
+        **params,
+        "codec": {
+            "gate": jax.tree.map(lambda x, g: x - 1e-2 * g, params["codec"]["gate"], gradient)
+        },
+    }
+    assert float(loss(better, ready)) < float(loss(params, ready))
+    assert [pattern for pattern, role in stage.rules if role == TRAIN] == [r"codec/gate/.*"]
+    for model in (
+        dataclasses.replace(GATED, observed="every"),
+        dataclasses.replace(GATED, codec=PixelConfig(spatial=4, temporal=1)),
+    ):
+        with pytest.raises(UserError, match="no gate that blends its frames"):
+            stage.require(model)
 
 
 def test_warping_needs_depth_and_other_words_are_refused():

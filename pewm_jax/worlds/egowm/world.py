@@ -30,10 +30,10 @@ from pewm_jax.config import (
     register,
 )
 from pewm_jax.config.assembled import WhereObserved
-from pewm_jax.errors import require
+from pewm_jax.errors import UserError, require
 from pewm_jax.registry import part
 from pewm_jax.types import Array, Clip, Control, Frames, Params, WorldState
-from pewm_jax.worlds import checks, objective, world_model
+from pewm_jax.worlds import checks, gating, objective, world_model
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage
 
@@ -56,6 +56,12 @@ class EgoWMTrainConfig(TrainSettings):
     adapt: StageConfig = StageConfig()
     """The backbone is trained further, with actions; the control's learning rate is
     `model.control.rate` times this one's."""
+    gate: StageConfig = StageConfig(steps=0)
+    """The codec's gate is trained on imagined clips, if it blends them with the warped observed
+    frame (`codec.gate`, `model.observed warped`); skipped by default."""
+    gate_lpips: float = 0.0
+    """Weight of LPIPS (AlexNet's, `pip install 'pewm-jax[metrics]'`) in the loss of stage `gate`; 0
+    leaves it out."""
     blind: float = 0.1
     """Share of clips without the input of guidance (the observed image or the text); needed for
     `model.noise.guidance` above 1."""
@@ -64,6 +70,22 @@ class EgoWMTrainConfig(TrainSettings):
         """Validate."""
         super().__post_init__()
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
+        require(self.gate_lpips >= 0, f"train.gate_lpips is {self.gate_lpips}: use 0 or more.")
+
+
+def require_gate(model: AssembledModel) -> None:
+    """Refuse to train the gate of a model that has none, or nothing to blend with.
+
+    Raises:
+        UserError: it does not blend its frames with the observed one.
+    """
+    assert isinstance(model, EgoWM)
+    if not model.gated:
+        raise UserError(
+            "train.gate.steps is above 0, but this model has no gate that blends its frames with "
+            "the observed one: give it a codec with a gate (codec.kind learned or pixel, "
+            "codec.gate 48) and model.observed warped, or set train.gate.steps 0."
+        )
 
 
 @register("world", "egowm")
@@ -153,15 +175,21 @@ class EgoWM(AssembledModel):
             perceptual=perceptual,
         )
 
+    @property
+    def gated(self) -> bool:
+        """Whether the codec's gate blends imagined frames with the warped observed one."""
+        return self.observed == "warped" and bool(getattr(self.codec, "gate", 0))
+
     def prepare(self, params: Params, clip: Clip) -> Clip:
         """Encode a batch's frames; see ``objective.prepare``."""
         return objective.prepare(self, params, clip, memory=False, history=self.history)
 
     def stages(self) -> tuple[Stage, ...]:
-        """Return the two stages.
+        """Return the two stages, and a third for the gate.
 
         ``video`` trains the backbone as a video model; the control is frozen, and has no effect at
-        first. ``adapt`` trains backbone and control, with actions.
+        first. ``adapt`` trains backbone and control, with actions. ``gate`` trains the codec's gate
+        on imagined clips; it is skipped without steps.
         """
         video = Stage(
             name="video",
@@ -182,7 +210,23 @@ class EgoWM(AssembledModel):
             optional=False,
             rates=((r"control/.*", self.control.rate),),
         )
-        return video, adapt
+        given = {"memory": False, "history": self.history}
+        gate = Stage(
+            name="gate",
+            number=3,
+            rules=(
+                (r"codec/gate/.*", TRAIN),
+                (r"(backbone|control|codec|image|text)/.*", FREEZE),
+            ),
+            init=EgoWM.init,
+            loss=functools.partial(gating.loss, **given),
+            prepare=functools.partial(gating.prepare, **given),
+            prepares_by=("backbone", "control", "codec", "image", "text"),
+            optional=True,
+            extra_weights=gating.perceptual_weights,
+            require=require_gate,
+        )
+        return video, adapt, gate
 
     def start(self, params: Params, frames: Frames) -> WorldState:
         """Begin a world; if there are fewer frames than ``history``, the first is repeated."""
@@ -265,6 +309,9 @@ class EgoWM(AssembledModel):
             blind = world_model.blind(self, params, given, np.ones((1,), bool))
         latents = world_model.draw(self, params, given, None, key, blind=blind)
         rgb, depth = rgbd.decode_rgbd(self, params, latents)
+        if self.gated:
+            view = world_model.splatted(self, jax.tree.map(lambda x: x[None], past), whole.camera)
+            rgb, depth = rgbd.mix(self, params, rgb, depth, view)
         depth = depth if self.clip.depth else jnp.zeros_like(depth)
         return Frames(rgb[0, self.history :], depth[0, self.history :], control.camera)
 

@@ -3,11 +3,8 @@
 Each clip is conditioned on the present frame, the control, and the memory's readout for its
 cameras. Imagined frames are inserted as observed ones are, with ``observed=False``.
 
-Stage ``gate`` fine-tunes the codec's gate, which blends imagined frames with the rendered memory.
-The codec trains it on true latents with noise, but the errors of imagined frames differ: they are
-sharp, plausible and displaced. So the model imagines each clip once, from the clip's first frame
-and with the memory of its context, and only the gate is trained to choose at each pixel. Stage
-``sharpen`` trains it further on such clips, with LPIPS and a discriminator (``worlds.sharpen``).
+Stages ``gate`` and ``sharpen`` fine-tune the codec's gate, which blends imagined frames with the
+rendered memory, on imagined clips (``worlds.gating``).
 """
 
 from __future__ import annotations
@@ -20,21 +17,14 @@ import jax
 import jax.numpy as jnp
 
 from pewm_jax.codecs import rgbd
-from pewm_jax.codecs.signals import as_signal, rgbd_signal
+from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError, register
 from pewm_jax.config.assembled import WhereObserved
 from pewm_jax.errors import require
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
-from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params, View, WorldState
-from pewm_jax.worlds import (
-    checks,
-    codec_losses,
-    objective,
-    perturbation,
-    sharpen,
-    world_model,
-)
+from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, View, WorldState
+from pewm_jax.worlds import checks, gating, objective, sharpen, world_model
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.pewm import candidates
 from pewm_jax.worlds.stages import ADVERSARY, FREEZE, TRAIN, Stage
@@ -48,84 +38,6 @@ def require_gate(model: AssembledModel) -> None:
             "colours in: give it a codec with a gate (codec.kind learned or pixel, codec.gate 48), "
             "clip.depth true and a memory of colours, or set train.gate.steps 0."
         )
-
-
-def prepare_gate(model: AssembledModel, params: Params, clip: Clip) -> Clip:
-    """Imagine a batch of clips with their memories; ``latents_thwC`` are those imagined.
-
-    The noise depends on the clips alone.
-
-    Raises:
-        UserError: see ``require_gate``.
-    """
-    require_gate(model)
-    readout = objective.clip_readout(model, params, clip, pictures=True)
-    frames = as_signal(clip.frames)
-    observed = jax.tree.map(lambda x: x[:, :1], frames)
-    control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
-    conditioning = world_model.condition(model, params, observed, control)
-    key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
-    shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
-    noise = jax.random.normal(key, shape)
-    latents = world_model.sample(
-        model, params, conditioning, readout, noise, jax.random.fold_in(key, 1)
-    )
-    return clip.without_context().with_extras(
-        context_features_ShwF=None, latents_thwC=latents, readout=readout
-    )
-
-
-def gate_loss(
-    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Return the loss of the gate on imagined frames; see ``codec_losses.score``."""
-    assert isinstance(train, TrainConfig)
-    perceptual = (train.gate_lpips, params["lpips"]) if train.gate_lpips else None
-    given = _gate_inputs(model, train, params, clip, key)
-    return codec_losses.score(model, params["codec"]["gate"], *given, perceptual)
-
-
-def sharpen_loss(
-    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
-) -> tuple[Array, dict[str, Array]]:
-    """Return the loss that sharpens the gate; see ``codec_losses.sharpen_gate``."""
-    given = _gate_inputs(model, train, params, clip, key)
-    return codec_losses.sharpen_gate(model, train, params, *given)
-
-
-def _gate_inputs(
-    model: AssembledModel, train: TrainSettings, params: Params, clip: Clip, key: Array
-) -> tuple[Array, Array, Array, Array, Frames]:
-    """Return imagined colours and depth, the rendered memory, its mask, and the true frames.
-
-    With ``train.memory_errors`` the rendering has errors. The frames were imagined without these,
-    so the gate can learn to prefer them there.
-    """
-    assert isinstance(train, TrainConfig)
-    if "latents_thwC" not in clip.extras:
-        clip = jax.lax.stop_gradient(prepare_gate(model, params, clip))
-    readout = clip.extras["readout"]
-    if train.memory_errors:
-        camera = clip.frames.camera
-        readout = perturbation.plant_errors(model, train.memory_errors, readout, camera, key)
-    view = readout.view
-    assert view is not None
-    rgb, depth = rgbd.decode_rgbd(model, params, clip.extras["latents_thwC"])
-    shown = rgbd_signal(model.clip, view.features_THWF[..., :3], view.depth_THW)
-    truth = jax.tree.map(lambda x: x[:, 1:], as_signal(clip.frames))
-    return rgb[:, 1:], depth[:, 1:], shown[:, 1:], view.seen_THW[:, 1:], truth
-
-
-def gate_perceptual(
-    model: AssembledModel, train: TrainSettings, weight: str = "gate_lpips"
-) -> Params | None:
-    """Return the weights that a loss with this weight of LPIPS needs, or None.
-
-    See ``codec_losses.lpips_weights``.
-    """
-    if not getattr(train, weight):
-        return None
-    return codec_losses.lpips_weights(codec_losses.LPIPS, model.clip)
 
 
 FROZEN = r"(codec|encoder|image|text)/.*"
@@ -163,12 +75,12 @@ GATE = Stage(
         (r"(backbone|control|memory|codec|encoder|image|text)/.*", FREEZE),
     ),
     init=world_model.init,
-    loss=gate_loss,
+    loss=gating.loss,
     memory=True,
-    prepare=prepare_gate,
+    prepare=gating.prepare,
     prepares_by=("backbone", "control", "memory", "codec", "encoder", "image", "text"),
     optional=True,
-    extra_weights=gate_perceptual,
+    extra_weights=gating.perceptual_weights,
     require=require_gate,
 )
 
@@ -190,8 +102,8 @@ SHARPEN = dataclasses.replace(
     number=5,
     rules=((sharpen.DISCRIMINATOR, ADVERSARY), *GATE.rules),
     init=_with_discriminator,
-    loss=sharpen_loss,
-    extra_weights=functools.partial(gate_perceptual, weight="sharpen_lpips"),
+    loss=gating.sharpen_loss,
+    extra_weights=functools.partial(gating.perceptual_weights, weight="sharpen_lpips"),
     require=_require_sharpen,
 )
 STAGES = (STAGE_1, STAGE_2, JOINT, GATE)
