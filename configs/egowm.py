@@ -24,7 +24,8 @@ def config() -> Config:
     Pixels are denoised by a U-ViT, without an autoencoder, whose errors would count in LPIPS. The
     observed frame conditions every frame, rendered by its depth from the camera to which the
     actions lead: the world has no memory, and what the present frame does not show has to be
-    imagined. LPIPS of denoised frames is part of the loss (``pip install 'pewm-jax[metrics]'``).
+    imagined. A gate blends imagined and rendered pixels; it is trained last, on imagined clips.
+    LPIPS is part of the losses (``pip install 'pewm-jax[metrics]'``).
     Batches are small: many steps learn faster. Steps and turns are small, so that what is observed
     stays in view for a while. Its data: ``pewm-jax data collect data/ego --train 1600 --validation
     16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10 --turn_around 0 --test_policy follow
@@ -34,7 +35,7 @@ def config() -> Config:
     return Config(
         model=EgoWM(
             clip=ClipConfig(height=64, width=64),
-            codec=PixelConfig(spatial=4, temporal=1),
+            codec=PixelConfig(spatial=4, temporal=1, gate=48),
             backbone=UViTBackbone(layers=6, heads=6, head_dim=32),
             actions=ActionConfig(step_m=0.12, turn_deg=10.0),
             control=ModulationConfig(units=(0.12, 0.12, 1.0)),
@@ -53,6 +54,8 @@ def config() -> Config:
             run="runs/egowm",
             optimizer="muon",
             adapt=StageConfig(steps=2200, batch=3, learning_rate=3e-3, warmup=100),
+            gate=StageConfig(steps=300, batch=4, learning_rate=1e-3, warmup=50),
+            gate_lpips=2.0,
             denoised_lpips=0.3,
             denoised_lpips_weights="equal",
             ema=0.999,

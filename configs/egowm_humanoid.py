@@ -3,7 +3,7 @@
 import dataclasses
 
 from pewm_jax.bodies.humanoid import HUMANOID
-from pewm_jax.config import Config
+from pewm_jax.config import Config, StageConfig
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.presets import egowm
 
@@ -13,10 +13,10 @@ def config() -> Config:
 
     They are those of ``egowm`` with another control: actions are the angles of the joints at the
     next frame with the linear and the angular velocity, and the initial state is a further input
-    (Eq. 6). There is no depth, and the observed frame conditions every frame as it is, since the
-    arms move against the room. Its data: ``pewm-jax data collect data/humanoid --body humanoid
-    --train 1600 --validation 16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10 --turn_around 0
-    --test_policy follow --ids``.
+    (Eq. 6). There is no depth and no gate, and the observed frame conditions every frame as it is,
+    since the arms move against the room. Its data: ``pewm-jax data collect data/humanoid --body
+    humanoid --train 1600 --validation 16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10
+    --turn_around 0 --test_policy follow --ids``.
     """
     base, size = egowm.config(), HUMANOID.size
     control = ModulationConfig(
@@ -33,11 +33,14 @@ def config() -> Config:
         model=dataclasses.replace(
             base.model,
             clip=dataclasses.replace(base.model.clip, depth=False),
+            codec=dataclasses.replace(base.model.codec, gate=0),
             control=control,
             observed="every",
         ),
         data=dataclasses.replace(
             base.data, path="data/humanoid", prepared_path="data/humanoid_prepared"
         ),
-        train=dataclasses.replace(base.train, run="runs/egowm_humanoid"),
+        train=dataclasses.replace(
+            base.train, run="runs/egowm_humanoid", gate=StageConfig(steps=0), gate_lpips=0.0
+        ),
     )

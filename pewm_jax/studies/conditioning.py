@@ -4,9 +4,9 @@ Rows: the actions added to the time embedding (the paper), as further tokens tha
 attends to, as further input channels, and a model that was trained without actions; beside them the
 observed frame, repeated. Every row has the same codec, network, data, seed and clips. Each gets as
 many steps as its time allows (``step_times``). A warped observed frame would tell every row how the
-agent moves, so all get it as it is instead (``model.observed every``); LPIPS is not in their loss,
-since the stage without actions cannot have it. Trained rows and scores are stored, so that the same
-command resumes.
+agent moves, so all get it as it is instead (``model.observed every``, no gate); LPIPS is not in
+their loss, since the stage without actions cannot have it. Trained rows and scores are stored, so
+that the same command resumes.
 """
 
 from __future__ import annotations
@@ -105,15 +105,20 @@ class Study:
         trained = dataclasses.replace(train.adapt, steps=steps)
         skipped = dataclasses.replace(train.adapt, steps=0)
         stages = (trained, skipped) if name == "none" else (skipped, trained)
-        observed = "every" if base.model.observed == "warped" else base.model.observed
+        model: dict[str, Any] = {"control": control}
+        if base.model.observed == "warped":
+            model["observed"] = "every"
+        if getattr(base.model.codec, "gate", 0):
+            model["codec"] = dataclasses.replace(base.model.codec, gate=0)
         return dataclasses.replace(
-            base.with_model(control=control, observed=observed),
+            base.with_model(**model),
             train=dataclasses.replace(
                 train,
                 run=str(self.folder(name, seed)),
                 seed=seed,
                 video=stages[0],
                 adapt=stages[1],
+                gate=dataclasses.replace(train.gate, steps=0),
                 denoised_lpips=0.0,
                 preview_every=0,
             ),

@@ -47,6 +47,7 @@ def test_every_row_gives_its_actions_in_its_way_and_trains_one_stage():
         assert config.model.control.inject == ("timestep" if name == "none" else name)
         assert config.model.backbone == base().model.backbone
         assert (config.model.observed, config.train.denoised_lpips) == ("every", 0)
+        assert (getattr(config.model.codec, "gate", 0), config.train.gate.steps) == (0, 0)
     assert base().model.observed == "warped"
 
 
