@@ -126,7 +126,7 @@ class Study:
 
     def stage(self, name: str) -> Stage:
         """Return the stage that a row trains."""
-        video, adapt = self.base.model.stages()
+        video, adapt, _ = self.base.model.stages()
         return video if name == "none" else adapt
 
 
