@@ -153,7 +153,7 @@ def test_it_is_an_environment(params):
 
 def test_its_settings_travel_and_what_cannot_work_is_refused():
     assert configuration.from_dict(Config, configuration.to_dict(CONFIG)) == CONFIG
-    assert worlds.stages(MODEL)[-1].rates == ((r"control/.*", 10.0),)
+    assert worlds.stages(MODEL)[1].rates == ((r"control/.*", 10.0),)
     for changes, says in (
         ({"memory": SurfelConfig()}, "the world egowm has no map"),
         ({"history": 5}, "fewer than clip.frames (5)"),
