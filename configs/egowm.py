@@ -13,7 +13,7 @@ NOISE = EDMConfig(
     log_std=1.3,
     sigma_min=0.03,
     sigma_max=20.0,
-    sample_steps=8,
+    sample_steps=4,
 )
 """Noise down to low levels, so that samples are sharp; sigma_data is that of colours."""
 
