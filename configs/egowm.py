@@ -61,5 +61,5 @@ def config() -> Config:
             ema=0.999,
             preview_every=0,
         ),
-        evaluate=EvalConfig(clips=48, chain=2),
+        evaluate=EvalConfig(clips=48, chain=2, seeds=(0,)),
     )
