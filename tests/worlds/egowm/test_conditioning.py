@@ -206,9 +206,9 @@ def test_a_network_without_further_tokens_refuses_them():
 
 def test_the_presets_have_the_frame_everywhere_low_noise_and_the_body():
     walks, humanoid = (presets.load(name) for name in ("egowm", "egowm_humanoid"))
-    for config in (walks, humanoid):
-        assert config.model.observed == "every"
-        assert not config.model.clip.depth
+    for config, observed in ((walks, "warped"), (humanoid, "every")):
+        assert config.model.observed == observed
+        assert config.model.clip.depth == config.model.gated == (observed == "warped")
         noise = config.model.noise
         assert (noise.log_mean, noise.log_std, noise.sigma_data) == (-0.3, 1.3, 0.5)
         assert config.model.control.inject == "timestep"
