@@ -33,7 +33,8 @@ def prepare(
         readout = objective.clip_readout(model, params, clip, pictures=True)
     else:
         readout = MemoryReadout(view=world_model.splatted(model, observed, frames.camera))
-    control = Control(frames.camera, clip.actions_TA, clip.extras.get("state_A"))
+    state = objective.state_at_start(clip, history)
+    control = Control(frames.camera, clip.actions_TA, state)
     conditioning = world_model.condition(model, params, observed, control)
     key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)

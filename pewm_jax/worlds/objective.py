@@ -128,6 +128,14 @@ def loss(
     return with_lpips(model, train, params, *found)
 
 
+def state_at_start(clip: Clip, history: int) -> Array | None:
+    """Return the (B, A) states of the agents at the last observed frame, if they are known."""
+    state = clip.extras.get("state_A")
+    if state is not None and clip.actions_TA is not None and history > 1:
+        return clip.actions_TA[:, history - 2]
+    return state
+
+
 class Denoised(NamedTuple):
     """One denoised frame of each clip of a batch.
 
@@ -168,10 +176,7 @@ def denoise(
         model, train, params, clip, x0, readout, (key, level_key, image_key), history
     )
     require_actions(model, clip.actions_TA, "the loss")
-    state = clip.extras.get("state_A")
-    if state is not None and clip.actions_TA is not None and history > 1:
-        state = clip.actions_TA[:, history - 2]  # the one at the last observed frame
-    control = Control(frames.camera, clip.actions_TA, state)
+    control = Control(frames.camera, clip.actions_TA, state_at_start(clip, history))
     conditioning = world_model.condition(model, params, observed, control, **more)
     if blind:
         hidden = jax.random.bernoulli(jax.random.fold_in(key, 6), blind, (len(x0),))
