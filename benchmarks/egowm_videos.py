@@ -20,8 +20,10 @@ import numpy as np
 import pewm_jax
 from pewm_jax import worlds
 from pewm_jax.bodies.humanoid import BODIES
+from pewm_jax.config import Config
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.eval.clips import load_clip
+from pewm_jax.eval.steering import with_actions
 from pewm_jax.eval.walks import choose_walks
 from pewm_jax.io import atomic
 from pewm_jax.report.pictures import as_bytes, grid, picture_steps, save_png
@@ -56,7 +58,9 @@ def main() -> None:
         other = load_clip(config, episodes, walks.others[number])[2]
         state = worlds.start(config, params, context)
         rows = {"truth": truth.rgb_THWC}
-        for name, steps in controls(config.model, control, other).items():
+        info = episodes[choice.episode].info
+        pose = np.asarray(context.camera.world_from_camera[-1])
+        for name, steps in controls(config, info, pose, control, other).items():
             key = jax.random.fold_in(jax.random.key(given.seed), number)
             frames = imagine(config, params, state, steps, key)[1]
             rows[name] = as_bytes(np.asarray(frames.rgb_THWC))
@@ -72,24 +76,23 @@ def main() -> None:
         print(title)
 
 
-def controls(model: Any, own: Any, other: Any) -> Mapping[str, Any]:
+def controls(
+    config: Config, info: Mapping[str, Any], pose: np.ndarray, own: Any, other: Any
+) -> Mapping[str, Any]:
     """Return the controls of a clip by caption."""
     if not isinstance(own, Control):
         return {"true actions": own, "another clip's": other}
-    found = {
-        "true actions": own,
-        "another clip's": dataclasses.replace(own, actions_TA=other.actions_TA),
-    }
-    body = BODIES.get(model.control.body)
-    if body is None:
-        return found
-    arms = np.array([one.name.startswith(ARMS) for one in body.freedoms])
-    walking = np.arange(body.size) >= body.size - 2
-    still = np.where(walking, 0.0, np.asarray(own.state_A))
-    for name, moves in (("arms alone", arms), ("walking alone", walking)):
-        actions = np.where(moves, np.asarray(own.actions_TA), still).astype(np.float32)
-        found[name] = dataclasses.replace(own, actions_TA=actions)
-    return found
+    actions = {"another clip's": np.asarray(other.actions_TA)}
+    body = BODIES.get(config.model.control.body)
+    if body is not None:
+        arms = np.array([one.name.startswith(ARMS) for one in body.freedoms])
+        walking = np.arange(body.size) >= body.size - 2
+        still = np.where(walking, 0.0, np.asarray(own.state_A))
+        for name, moves in (("arms alone", arms), ("walking alone", walking)):
+            moved = np.where(moves, np.asarray(own.actions_TA), still)
+            actions[name] = moved.astype(np.float32)
+    changed = {name: with_actions(config, info, pose, own, each) for name, each in actions.items()}
+    return {"true actions": own} | changed
 
 
 if __name__ == "__main__":

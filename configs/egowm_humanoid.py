@@ -3,7 +3,7 @@
 import dataclasses
 
 from pewm_jax.bodies.humanoid import HUMANOID
-from pewm_jax.config import Config, StageConfig
+from pewm_jax.config import Config
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.presets import egowm
 
@@ -11,11 +11,12 @@ from pewm_jax.presets import egowm
 def config() -> Config:
     """Return the settings of ``egowm_humanoid``.
 
-    They are those of ``egowm`` with another control: actions are the angles of the joints at the
-    next frame with the linear and the angular velocity, and the initial state is a further input
-    (Eq. 6). There is no depth and no gate, and the observed frame conditions every frame as it is,
-    since the arms move against the room. Its data: ``pewm-jax data collect data/humanoid --body
-    humanoid --train 1600 --validation 16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10
+    They are those of ``egowm``, whose shipped weights training starts from, with another control:
+    actions are the angles of the joints at the next frame with the linear and the angular velocity,
+    and the initial state is a further input (Eq. 6). The observed frame is rendered from the
+    camera on the body's head, which follows from its joints; the arms in it do not stay where they
+    were, so the network erases and draws them. Its data: ``pewm-jax data collect data/humanoid
+    --body humanoid --train 1200 --validation 16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10
     --turn_around 0 --test_policy follow --ids``.
     """
     base, size = egowm.config(), HUMANOID.size
@@ -30,17 +31,15 @@ def config() -> Config:
     )
     return dataclasses.replace(
         base,
-        model=dataclasses.replace(
-            base.model,
-            clip=dataclasses.replace(base.model.clip, depth=False),
-            codec=dataclasses.replace(base.model.codec, gate=0),
-            control=control,
-            observed="every",
-        ),
+        model=dataclasses.replace(base.model, control=control),
         data=dataclasses.replace(
             base.data, path="data/humanoid", prepared_path="data/humanoid_prepared"
         ),
         train=dataclasses.replace(
-            base.train, run="runs/egowm_humanoid", gate=StageConfig(steps=0), gate_lpips=0.0
+            base.train,
+            run="runs/egowm_humanoid",
+            start="egowm",
+            fresh=("control/.*",),
+            adapt=dataclasses.replace(base.train.adapt, steps=1500),
         ),
     )

@@ -209,6 +209,29 @@ class Body:
         base = np.asarray(world_from_camera, np.float64) @ np.linalg.inv(own.astype(np.float64))
         return np.array([base[0, 3], base[1, 3], np.arctan2(base[1, 0], base[0, 0])])
 
+    def cameras_along(
+        self,
+        world_from_camera: np.ndarray,
+        state_A: np.ndarray,
+        actions_TA: np.ndarray,
+        scale: float = 1.0,
+    ) -> np.ndarray:
+        """Return the (T, 4, 4) float32 poses of the camera after each of T actions.
+
+        Args:
+            world_from_camera: (4, 4) pose of the camera before them.
+            state_A: the state then.
+            actions_TA: the states that follow.
+            scale: size of the body.
+        """
+        places = [self.planar_of(world_from_camera, state_A, scale)]
+        for action_A in np.asarray(actions_TA):
+            places.append(advance(places[-1], action_A))
+        states = np.concatenate([np.asarray(state_A)[None], actions_TA])
+        poses = self.world_from_camera(np.stack(places), states, scale)
+        poses[:, 2, 3] += world_from_camera[2, 3] - poses[0, 2, 3]
+        return poses[1:]
+
     def toward(self, state_A: np.ndarray, wished_A: np.ndarray) -> np.ndarray:
         """Return the state one frame later on the way to another, standing still.
 

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax import worlds
-from pewm_jax.bodies.humanoid import arm_ids
+from pewm_jax.bodies.humanoid import BODIES, arm_ids
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import AssembledModel, Config, UserError
 from pewm_jax.data.episodes import Episode
@@ -268,9 +268,7 @@ class _Pieces:
         else:
             given = controls
             if kind == SHUFFLED:
-                others = self.walks.others[first : first + self.size]
-                pairs = zip(controls, others, strict=True)
-                given = [_with_actions(one, self._load(other)[2]) for one, other in pairs]
+                given = self._others(first, context, controls)
             numbers, padded = np.arange(first, first + self.size), stack(given, self.size)
             if kind == WARP:
                 rgb = _warped(self.config, context, padded)
@@ -283,6 +281,19 @@ class _Pieces:
             each = np.asarray(self.measures.lpips.frames(rgb, truth.rgb_THWC))[:count]
             found["lpips"] = np.concatenate([each.mean(1, keepdims=True), each], 1)
         return found | self._by_masks(context, rgb, first, count)
+
+    def _others(self, first: int, context: Frames, controls: Sequence[Any]) -> list[Any]:
+        """Return the controls of a batch's clips with the actions of clips in other houses."""
+        found = []
+        for k, own in enumerate(controls):
+            choice, other = (x[first + k] for x in (self.walks.choices, self.walks.others))
+            others = self._load(other)[2]
+            if isinstance(own, Control):
+                pose = np.asarray(context.camera.world_from_camera[k, -1])
+                info = self.episodes[choice.episode].info
+                others = with_actions(self.config, info, pose, own, np.asarray(others.actions_TA))
+            found.append(_arrays(others))
+        return found
 
     def _by_masks(
         self, context: Frames, rgb: Array, first: int, count: int
@@ -331,11 +342,42 @@ def _arrays(control: Any) -> Any:
     return jax.tree.map(np.asarray, control)
 
 
-def _with_actions(own: Any, other: Any) -> Any:
-    """Return a clip's control with the actions of another; its cameras and its state stay."""
-    if not isinstance(own, Control):
-        return _arrays(other)
-    return dataclasses.replace(own, actions_TA=np.asarray(other.actions_TA))
+def with_actions(
+    config: Config,
+    info: Mapping[str, Any],
+    world_from_camera: np.ndarray,
+    own: Control,
+    actions_TA: np.ndarray,
+) -> Control:
+    """Return a clip's control with other actions; its state stays.
+
+    Its cameras stay, too, if the model does not see them; a model that gets the warped observed
+    frame gets the cameras to which the actions lead.
+
+    Args:
+        config: the settings.
+        info: the episode's, with the size of the body.
+        world_from_camera: (4, 4) pose of the present camera.
+        own: the clip's control.
+        actions_TA: the other actions.
+
+    Raises:
+        UserError: the cameras to which the actions lead are unknown.
+    """
+    if not _warps(config):
+        return dataclasses.replace(own, actions_TA=actions_TA)
+    about = info.get("body") or {}
+    body = BODIES.get(about.get("name", ""))
+    if body is None or own.state_A is None:
+        raise UserError(
+            "this world renders the observed frame from the cameras to which actions lead, and "
+            "those of recorded actions are known for a known body alone: use data collected with "
+            "--body, or train with model.observed every."
+        )
+    state = np.asarray(own.state_A)
+    poses = body.cameras_along(world_from_camera, state, actions_TA, about["scale"])
+    camera = dataclasses.replace(own.camera, world_from_camera=poses)
+    return Control(camera, actions_TA, own.state_A)
 
 
 def _imagined(

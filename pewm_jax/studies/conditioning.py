@@ -115,6 +115,7 @@ class Study:
             train=dataclasses.replace(
                 train,
                 run=str(self.folder(name, seed)),
+                start="",
                 seed=seed,
                 video=stages[0],
                 adapt=stages[1],

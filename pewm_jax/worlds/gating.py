@@ -19,6 +19,9 @@ from pewm_jax.config import AssembledModel, TrainSettings
 from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params
 from pewm_jax.worlds import codec_losses, objective, perturbation, world_model
 
+LPIPS_WEIGHT = "gate_lpips"
+"""Name of the setting with the weight of LPIPS in ``loss``."""
+
 
 def prepare(
     model: AssembledModel, params: Params, clip: Clip, *, memory: bool = True, history: int = 1
@@ -59,7 +62,7 @@ def loss(
     history: int = 1,
 ) -> tuple[Array, dict[str, Array]]:
     """Return the loss of the gate on imagined frames; see ``codec_losses.score``."""
-    weight = getattr(train, "gate_lpips", 0.0)
+    weight = getattr(train, LPIPS_WEIGHT)
     perceptual = (weight, params["lpips"]) if weight else None
     given = _inputs(model, train, params, clip, key, memory=memory, history=history)
     return codec_losses.score(model, params["codec"]["gate"], *given, perceptual)
@@ -104,7 +107,7 @@ def _inputs(
 
 
 def perceptual_weights(
-    model: AssembledModel, train: TrainSettings, weight: str = "gate_lpips"
+    model: AssembledModel, train: TrainSettings, weight: str = LPIPS_WEIGHT
 ) -> Params | None:
     """Return the weights that a loss with this weight of LPIPS needs, or None.
 

@@ -123,6 +123,17 @@ def test_walking_is_recovered_from_positions():
     assert not found[0].any()
 
 
+def test_cameras_follow_from_actions_wherever_the_body_stands():
+    rng = np.random.default_rng(4)
+    states = rng.uniform(0.3 * HUMANOID.low, 0.3 * HUMANOID.high, (6, HUMANOID.size))
+    planar = [np.array([0.3, -0.1, 3.0])]
+    for state in states[1:]:
+        planar.append(advance(planar[-1], state))
+    poses = HUMANOID.world_from_camera(np.stack(planar), states, 1.7, floor_z=0.4)
+    found = HUMANOID.cameras_along(poses[0], states[0], states[1:], 1.7)
+    np.testing.assert_allclose(found, poses[1:], atol=1e-5)
+
+
 WALK = (Freedom(FORWARD, -1, 1), Freedom(TURN, -1, 1))
 ONE = Body("one", (Freedom("a", -1, 1), *WALK), (Joint("arm", "", (0, 0, 1), freedom="a"),), "arm")
 

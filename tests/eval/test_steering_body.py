@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets
-from pewm_jax.config import ClipConfig
+from pewm_jax.config import ClipConfig, UserError
 from pewm_jax.data.episodes import read_episode
 from pewm_jax.data.make_episode import CollectConfig, make_episode
 from pewm_jax.eval import clips, evaluate, steering
@@ -26,8 +26,9 @@ SIZE, IMAGINED = 32, 4
 @functools.cache
 def config():
     loaded = presets.load("egowm_humanoid")
+    assert loaded.model.observed == "warped"
     model = dataclasses.replace(
-        loaded.model, clip=ClipConfig(frames=IMAGINED + 1, height=SIZE, width=SIZE, depth=False)
+        loaded.model, clip=ClipConfig(frames=IMAGINED + 1, height=SIZE, width=SIZE)
     )
     evaluate = dataclasses.replace(loaded.evaluate, chain=2, batch=2, clips=3)
     data = dataclasses.replace(loaded.data, context=2)
@@ -71,7 +72,7 @@ def told(monkeypatch):
 
     class Jax:
         jit = staticmethod(lambda function, **_: function)
-        tree = steering.jax.tree
+        tree, lax = steering.jax.tree, steering.jax.lax
 
     monkeypatch.setattr(steering, "_imagined", imagined)
     monkeypatch.setattr(steering, "jax", Jax)
@@ -110,12 +111,26 @@ def test_arms_and_objects_are_scored_by_kind_of_actions(told):
     assert all(isinstance(control, Control) for control in told)
     np.testing.assert_allclose(told[0].state_A, told[1].state_A)  # the own state stays
     assert np.abs(told[0].actions_TA - told[1].actions_TA).max() > 0.1
+    walks = choose_walks(config(), episodes(), 3, 2)
+    own, other = (episodes()[x[0].episode] for x in (walks.choices, walks.others))
+    targets = list(walks.choices[0].targets_N)
+    np.testing.assert_allclose(
+        told[0].camera.world_from_camera[0], own.world_from_camera[targets], atol=1e-6
+    )
+    moved = told[1].camera.world_from_camera[0]  # to where the other's actions lead
+    assert np.abs(moved - told[0].camera.world_from_camera[0]).max() > 0.05
+    here = own.world_from_camera[walks.choices[0].start]
+    there = other.world_from_camera[[walks.others[0].start, *walks.others[0].targets_N]]
+    heights = there[1:, 2, 3] - there[0, 2, 3]
+    np.testing.assert_allclose(np.diff(moved[:, 2, 3]), np.diff(heights), atol=1e-4)
+    assert abs(moved[0, 2, 3] - here[2, 3]) < 0.2
     facts = found.facts()
     arms, scs = (facts["scores"][name]["all"] for name in ("arms", "scs"))
     assert arms["true"]["mean"] == pytest.approx(arms["truth"]["mean"])
     assert arms["true"]["mean"] > 0.8
     assert arms["shuffled"]["mean"] < 0.5 * arms["true"]["mean"]
-    assert arms["none"]["mean"] == 0
+    assert "none" not in arms  # the warped frame would follow the actions
+    assert arms["warp"]["mean"] < arms["true"]["mean"]
     assert scs["true"]["mean"] == pytest.approx(scs["truth"]["mean"])
     assert scs["true"]["mean"] > scs["shuffled"]["mean"]
     assert facts["all"]["true"]["mean"] > 60
@@ -127,6 +142,19 @@ def test_arms_and_objects_are_scored_by_kind_of_actions(told):
     sentences = format_steering({"steering": facts, "protocol": {}})
     assert any(one.startswith("IoU of the arms with actions: true") for one in sentences)
     assert any("frame 8:" in line for line in found.lines())
+
+
+def test_without_a_known_body_it_is_unknown_where_other_actions_lead():
+    choice = clips.choose(config(), episodes(), 3, 2)[1]
+    control = clips.load_clip(config(), episodes(), choice)[2]
+    actions = np.zeros_like(control.actions_TA)
+    with pytest.raises(UserError, match="known for a known body alone"):
+        steering.with_actions(config(), {}, np.eye(4), control, actions)
+    model = dataclasses.replace(config().model, observed="every")
+    unseen = dataclasses.replace(config(), model=model)
+    found = steering.with_actions(unseen, {}, np.eye(4), control, actions)
+    assert found.camera is control.camera
+    assert not np.any(found.actions_TA)
 
 
 def test_a_report_measures_steering_although_the_camera_on_the_head_moves_freely(monkeypatch):

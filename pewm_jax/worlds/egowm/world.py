@@ -73,14 +73,18 @@ class EgoWMTrainConfig(TrainSettings):
         require(self.gate_lpips >= 0, f"train.gate_lpips is {self.gate_lpips}: use 0 or more.")
 
 
+def gated(model: AssembledModel) -> bool:
+    """Tell whether the codec's gate blends imagined frames with the warped observed one."""
+    return model.observed == "warped" and bool(getattr(model.codec, "gate", 0))
+
+
 def require_gate(model: AssembledModel) -> None:
     """Refuse to train the gate of a model that has none, or nothing to blend with.
 
     Raises:
         UserError: it does not blend its frames with the observed one.
     """
-    assert isinstance(model, EgoWM)
-    if not model.gated:
+    if not gated(model):
         raise UserError(
             "train.gate.steps is above 0, but this model has no gate that blends its frames with "
             "the observed one: give it a codec with a gate (codec.kind learned or pixel, "
@@ -174,11 +178,6 @@ class EgoWM(AssembledModel):
             blind=train.blind,
             perceptual=perceptual,
         )
-
-    @property
-    def gated(self) -> bool:
-        """Whether the codec's gate blends imagined frames with the warped observed one."""
-        return self.observed == "warped" and bool(getattr(self.codec, "gate", 0))
 
     def prepare(self, params: Params, clip: Clip) -> Clip:
         """Encode a batch's frames; see ``objective.prepare``."""
@@ -309,7 +308,7 @@ class EgoWM(AssembledModel):
             blind = world_model.blind(self, params, given, np.ones((1,), bool))
         latents = world_model.draw(self, params, given, None, key, blind=blind)
         rgb, depth = rgbd.decode_rgbd(self, params, latents)
-        if self.gated:
+        if gated(self):
             view = world_model.splatted(self, jax.tree.map(lambda x: x[None], past), whole.camera)
             rgb, depth = rgbd.mix(self, params, rgb, depth, view)
         depth = depth if self.clip.depth else jnp.zeros_like(depth)

@@ -18,7 +18,7 @@ from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.control import cut_into_clips
-from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig
+from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig, gated
 from pewm_jax.worlds.pewm import candidates
 from tests.helpers import random_camera, random_frames, randomised
 from tests.train.test_egowm import SVD
@@ -183,9 +183,17 @@ def test_training_has_the_state_of_the_last_observed_frame(monkeypatch):
     monkeypatch.setattr(world_model, "condition", condition)
     with pytest.raises(InterruptedError):
         worlds.stages(model)[1].loss(model, EgoWMTrainConfig(), params, clip, KEY)
-    ((observed, state),) = found
-    assert observed == 3
-    np.testing.assert_array_equal(state, clip.actions_TA[:, 1])
+    depth = dataclasses.replace(
+        model,
+        clip=dataclasses.replace(model.clip, depth=True),
+        codec=PixelConfig(temporal=1, gate=4),
+        observed="warped",
+    )
+    with pytest.raises(InterruptedError):  # clips on which the gate is trained
+        worlds.stages(depth)[2].prepare(depth, random_params(depth), clip)
+    assert [count for count, _ in found] == [3, 3]
+    for _, state in found:
+        np.testing.assert_array_equal(state, clip.actions_TA[:, 1])
 
 
 def test_a_network_without_further_tokens_refuses_them():
@@ -206,9 +214,10 @@ def test_a_network_without_further_tokens_refuses_them():
 
 def test_the_presets_have_the_frame_everywhere_low_noise_and_the_body():
     walks, humanoid = (presets.load(name) for name in ("egowm", "egowm_humanoid"))
-    for config, observed in ((walks, "warped"), (humanoid, "every")):
-        assert config.model.observed == observed
-        assert config.model.clip.depth == config.model.gated == (observed == "warped")
+    for config in (walks, humanoid):
+        assert config.model.observed == "warped"
+        assert config.model.clip.depth
+        assert gated(config.model)
         noise = config.model.noise
         assert (noise.log_mean, noise.log_std, noise.sigma_data) == (-0.3, 1.3, 0.5)
         assert config.model.control.inject == "timestep"
