@@ -1,7 +1,7 @@
 """Weights that ship with the library, by name; they need no network access.
 
 Each is a folder here, in the format of ``pewm-jax convert export inference``: ``config.json``,
-``weights.safetensors`` in 16 bits, and ``README.md``, its card. ``pewm_jax.load("codec")`` and
+``weights.safetensors`` in 16 or 8 bits, and ``README.md``, its card. ``pewm_jax.load("codec")`` and
 ``train.start codec`` find them. Names such as ``org/name`` are looked up on a hub (``io.hub``).
 """
 

@@ -115,7 +115,9 @@ def test_weights_that_come_with_the_library_are_found_by_name(tmp_path, monkeypa
         config, params = pewm_jax.load(name)
         assert (shipped.find(name) / "README.md").is_file()
         assert all(np.isfinite(leaf.astype(np.float32)).all() for leaf in jax.tree.leaves(params))
-        assert all(leaf.dtype.itemsize == 2 for leaf in jax.tree.leaves(params))
+        stored = weights.metadata(shipped.find(name) / "weights.safetensors")["dtype"]
+        kept = {2, 4} if stored == "int8" else {2}  # kernels in 8 bits are loaded in float32
+        assert {leaf.dtype.itemsize for leaf in jax.tree.leaves(params)} == kept
         if isinstance(config.model, CodecTask):
             video = jnp.zeros((1, 2, 16, 24, 3))
             latents = config.model.codec.encode(params["codec"], video)
