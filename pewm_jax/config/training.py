@@ -246,7 +246,7 @@ class TrainSettings:
     """Train low-rank adapters in place of the weights."""
     fresh: tuple[str, ...] = (r"memory/.*",)
     """Parameter paths (regular expressions) that may be missing from the weights a stage starts
-    from; these parameters start at random."""
+    from, or have another shape there; these parameters start at random."""
     image_noise_mean: float = -3.0
     """Mean of log σ of the noise added to the observed first frame."""
     image_noise_std: float = 0.5

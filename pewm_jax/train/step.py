@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh
 
@@ -60,8 +61,7 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
     """
     params = stage.init(config.model, key)
     if start is not None:
-        require_start(config, stage, start, params)
-        leaves = tree.flatten(start)
+        leaves = tree.flatten(require_start(config, stage, start, params))
         params = tree.unflatten(
             {
                 path: jnp.asarray(leaves[path], leaf.dtype) if path in leaves else leaf
@@ -83,27 +83,35 @@ def create(config: Config, stage: Stage, key: Array, start: Params | None = None
     )
 
 
-def require_start(config: Config, stage: Stage, start: Any, like: Params) -> None:
-    """Raise an error unless a stage can start from these weights.
+def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Params:
+    """Return the weights that a stage starts from, or raise an error if it cannot.
 
     Leaves that match ``train.fresh`` may be missing and are initialized randomly: the memory blocks
-    of stage 2, which the weights of stage 1 do not contain. So may those that serve training alone,
-    which no weights contain. ``start`` and ``like``, all parameters of the stage, may be their
-    shapes.
+    of stage 2, which the weights of stage 1 do not contain. Those of another shape are left out,
+    such as the control of other actions. Leaves that serve training alone may be missing, too; no
+    weights contain them. ``start`` and ``like``, all parameters of the stage, may be their shapes.
 
     Raises:
         TreeError: another leaf is missing, a leaf is unexpected or has another shape; lists them.
     """
-    leaves = tree.flatten(start)
+    parameters = tree.flatten(like)
+    leaves = {
+        path: leaf
+        for path, leaf in tree.flatten(start).items()
+        if path not in parameters
+        or np.shape(leaf) == np.shape(parameters[path])
+        or not lora.matches(config.train.fresh, path)
+    }
     lacking = (*config.train.fresh, *stage.training_only)
     wanted = {
         path: leaf
-        for path, leaf in tree.flatten(like).items()
+        for path, leaf in parameters.items()
         if path in leaves or not lora.matches((*lacking, lora.PATHS), path)
     }
     allowed = ", ".join(config.train.fresh) or "none"
     what = f"Initial weights of {stage.title} (may lack, by train.fresh: {allowed})"
     tree.require_like(leaves, wanted, what)
+    return tree.unflatten(leaves)
 
 
 def update_ema(ema: Params, trained: Params, step: Array, decay: float) -> Params:
@@ -128,7 +136,7 @@ def start_params(config: Config, stage: Stage, like: TrainState, start: Params) 
 
     ``like`` is the abstract state; see ``require_start`` for errors.
     """
-    require_start(config, stage, start, like.params)
+    start = require_start(config, stage, start, like.params)
     kept = set(stage.stored)
     rest = {path: x for path, x in tree.flatten(start).items() if path not in kept}
     return sharding.place(tree.unflatten(rest), like.params)
@@ -258,7 +266,7 @@ def initial_state(
     like = abstract_state(config, stage, mesh)
     shardings = jax.tree.map(lambda leaf: leaf.sharding, like)
     if start is not None:
-        require_start(config, stage, start, like.params)
+        start = require_start(config, stage, start, like.params)
         start = sharding.place(start, like.params)
     make = jax.jit(functools.partial(create, config, stage), out_shardings=shardings)
     return make(weights_key(config, stage), start)

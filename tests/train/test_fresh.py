@@ -61,6 +61,15 @@ def test_train_fresh_says_what_may_be_absent(whole):
         fakes.config(fresh=("(",))
 
 
+def test_of_another_shape_may_be_what_may_be_absent(whole):
+    other = {**whole, "memory": {**whole["memory"], "kernel": np.ones((7, 5), np.float32)}}
+    made = create(other)
+    assert "memory/kernel" in same(made.params, fakes.init(None, KEY))
+    assert same(made.params, whole) >= {"backbone/kernel", "backbone/bias", "memory/gate"}
+    with pytest.raises(tree.TreeError, match=r"memory/kernel has shape \(7, 5\)"):
+        create(other, fresh=())
+
+
 def test_the_rule_is_known_before_anything_is_computed(whole):
     shapes = jax.eval_shape(functools.partial(fakes.init, None), KEY)
     config = fakes.config()
