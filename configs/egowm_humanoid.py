@@ -6,6 +6,7 @@ from pewm_jax.bodies.humanoid import HUMANOID
 from pewm_jax.config import Config
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.presets import egowm
+from pewm_jax.worlds.egowm.world import EgoWMTrainConfig
 
 
 def config() -> Config:
@@ -20,6 +21,7 @@ def config() -> Config:
     --turn_around 0 --test_policy follow --ids``.
     """
     base, size = egowm.config(), HUMANOID.size
+    assert isinstance(base.train, EgoWMTrainConfig)
     control = ModulationConfig(
         actions=size,
         state=size,
