@@ -14,13 +14,15 @@ import dataclasses
 import functools
 import statistics
 import time
+from typing import Any
 
 import jax
 import numpy as np
 from record import machine, record, table
 
 from pewm_jax import presets, worlds
-from pewm_jax.types import Camera, Frames
+from pewm_jax.geometry.actions import integrate
+from pewm_jax.types import Camera, Control, Frames
 from pewm_jax.worlds.egowm.world import EgoWM
 
 PRESET = "egowm"
@@ -30,7 +32,7 @@ def models(preset: str, chunk: int, steps: int) -> dict[str, EgoWM]:
     """Return the two ways: the same networks, clips of 2 frames and of ``chunk`` + 1."""
     base = presets.load(preset).model
     assert isinstance(base, EgoWM)
-    noise = dataclasses.replace(base.noise, sample_steps=steps)
+    noise = dataclasses.replace(base.noise, sample_steps=steps or base.noise.sample_steps)
 
     def of(frames: int) -> EgoWM:
         return dataclasses.replace(
@@ -45,7 +47,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--frames", type=int, default=64, help="frames to imagine")
     parser.add_argument("--chunk", type=int, default=8, help="frames of a chunk")
-    parser.add_argument("--steps", type=int, default=8, help="evaluations of the network")
+    parser.add_argument("--steps", type=int, default=0, help="sampling steps; 0: the preset's")
     parser.add_argument("--repeats", type=int, default=5, help="timed runs of each")
     parser.add_argument("--preset", default=PRESET, help="whose network it is")
     parser.add_argument("--record", action="store_true", help="rewrite this section of RESULTS.md")
@@ -56,8 +58,8 @@ def main() -> None:
         params = jax.jit(worlds.init, static_argnums=0)(model, jax.random.key(0))
         state = worlds.start(model, params, _frame(model))
         run = jax.jit(functools.partial(worlds.imagine, model))
-        actions = np.tile(np.array([[0.25, 0, 0.1]], np.float32), (given.frames, 1))
-        runs[name] = functools.partial(run, params, state, actions, jax.random.key(1))
+        control = _control(model, given.frames)
+        runs[name] = functools.partial(run, params, state, control, jax.random.key(1))
         jax.block_until_ready(runs[name]())
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(given.repeats):
@@ -73,12 +75,24 @@ def main() -> None:
     text = table(["", "seconds, median", "least … most", "of the chunks' time"], rows)
     print(text)
     if given.record:
+        steps = next(iter(ways.values())).noise.sample_steps
         how = (
             f"`python benchmarks/egowm_latency.py --record`: {given.frames} frames, the network of "
-            f"`{given.preset}` with random weights, {given.steps} evaluations of it, "
+            f"`{given.preset}` with random weights, {steps} sampling steps, "
             f"{given.repeats} turns, on {jax.devices()[0].device_kind}. {machine('jax')}."
         )
         record("egowm_latency", "\n\n".join(["## Frame by frame against chunks", how, text]))
+
+
+def _control(model: EgoWM, frames: int) -> Any:
+    """Return planar actions or, for others, a control with the cameras of such actions."""
+    actions = np.tile(np.array([[0.25, 0, 0.1]], np.float32), (frames, 1))
+    present, count = _frame(model).camera, model.batch_spec.actions
+    if count == actions.shape[1]:
+        return actions
+    poses = integrate(present.world_from_camera[0], actions)[1:]
+    camera = Camera(np.repeat(present.intrinsics_4, frames, 0), np.asarray(poses))
+    return Control(camera, np.zeros((frames, count), np.float32), np.zeros(count, np.float32))
 
 
 def _frame(model: EgoWM) -> Frames:

@@ -22,6 +22,7 @@ from pewm_jax import worlds
 from pewm_jax.bodies.humanoid import BODIES
 from pewm_jax.config import Config
 from pewm_jax.data.dataset import EpisodeSource
+from pewm_jax.data.episodes import Episode
 from pewm_jax.eval.clips import load_clip
 from pewm_jax.eval.steering import with_actions
 from pewm_jax.eval.walks import choose_walks
@@ -58,9 +59,8 @@ def main() -> None:
         other = load_clip(config, episodes, walks.others[number])[2]
         state = worlds.start(config, params, context)
         rows = {"truth": truth.rgb_THWC}
-        info = episodes[choice.episode].info
-        pose = np.asarray(context.camera.world_from_camera[-1])
-        for name, steps in controls(config, info, pose, control, other).items():
+        episode = episodes[choice.episode]
+        for name, steps in controls(config, episode, choice.start, control, other).items():
             key = jax.random.fold_in(jax.random.key(given.seed), number)
             frames = imagine(config, params, state, steps, key)[1]
             rows[name] = as_bytes(np.asarray(frames.rgb_THWC))
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def controls(
-    config: Config, info: Mapping[str, Any], pose: np.ndarray, own: Any, other: Any
+    config: Config, episode: Episode, start: int, own: Any, other: Any
 ) -> Mapping[str, Any]:
     """Return the controls of a clip by caption."""
     if not isinstance(own, Control):
@@ -91,7 +91,9 @@ def controls(
         for name, moves in (("arms alone", arms), ("walking alone", walking)):
             moved = np.where(moves, np.asarray(own.actions_TA), still)
             actions[name] = moved.astype(np.float32)
-    changed = {name: with_actions(config, info, pose, own, each) for name, each in actions.items()}
+    changed = {
+        name: with_actions(config, episode, start, own, each) for name, each in actions.items()
+    }
     return {"true actions": own} | changed
 
 

@@ -13,7 +13,7 @@ def config() -> Config:
 
     The demo's codec and form of backbone. It first becomes a video model, without actions, and then
     learns to follow them. Steps and turns are small, so that what is observed stays in view for a
-    while: there is no memory to ask. Its data: ``pewm-jax data collect data/ego --train 256
+    while: the world has no memory. Its data: ``pewm-jax data collect data/ego --train 256
     --validation 8 --frames 64 --step_m 0.12 --turn_deg 10 --turn_around 0 --test_policy follow
     --ids``. Test scenes are walked, since revisits with turns of 10 degrees consist of turns on the
     spot.

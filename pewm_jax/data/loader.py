@@ -340,8 +340,8 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
     if spec.depth and not (first.has_depth and all(listed.values())):
         raise ConfigError(
             f"{source.path} has episodes without depth, and {name} needs it, for its memory or "
-            "to generate it: import depth too, or use a world that needs none, such as egowm with "
-            "--clip.depth False, or nomad."
+            "to generate it: import depth too, or use a world that needs none, such as egowm_tiny "
+            "or nomad."
         )
     found = None if first.states is None else first.states.shape[1:]
     if state and found != state.shape:
@@ -353,7 +353,7 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
     if spec.poses and first.info.get("poses") == "unknown":
         raise ConfigError(
             f"{source.path} has episodes whose camera poses are unknown, and {name} needs them: "
-            "import them with --pose, or use a world steered by actions, such as egowm."
+            "import them with --pose, or use a world steered by actions alone, such as egowm_tiny."
         )
 
 

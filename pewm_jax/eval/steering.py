@@ -2,9 +2,10 @@
 
 A world that follows its actions is closest to the ground truth with the true ones. *Shuffled*
 actions are those of a clip in another house. *None* are zero embeddings, as observed frames have:
-available only for models whose control can be zeroed. *Copy* is a baseline without a network that
-repeats the observed frame; *warp*, for worlds that get it warped, shows it by its depth from the
-camera to which the actions lead, holes filled from the nearest pixel. ``walks`` chooses the clips.
+available only for models whose control can be zeroed and whose observed frame is not warped.
+*Copy* is a baseline without a network that repeats the observed frame; *warp*, for worlds that get
+it warped, shows it by its depth from the camera to which the actions lead, holes filled from the
+nearest pixel. ``walks`` chooses the clips.
 
 Every kind of actions is scored by the squared error of colours and, where they can be measured, by
 LPIPS, by SCS with exact masks of the true clip, and by the IoU of the agent's arms with the truth.
@@ -23,8 +24,10 @@ import numpy as np
 
 from pewm_jax import worlds
 from pewm_jax.bodies.humanoid import BODIES, arm_ids
+from pewm_jax.bodies.kinematics import Body
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import AssembledModel, Config, UserError
+from pewm_jax.data.clips import state_at
 from pewm_jax.data.episodes import Episode
 from pewm_jax.eval import statistics
 from pewm_jax.eval.clips import ClipChoice, load_clip, stack
@@ -212,13 +215,16 @@ def score(
     among = {choice.episode for choice in choices}
     try:
         walks = choose_walks(config, episodes, len(choices), config.evaluate.chain, among)
+        if walks.recorded and _warps(config):
+            for choice in walks.choices:
+                _body_of(episodes[choice.episode])
     except UserError as error:
         return None, f"Steering is not measured: {error}"
     measures = measures or Measures()
     pieces = _Pieces(config, params, episodes, walks, config.evaluate.seeds[0], measures)
 
     def work(todo: list[tuple[str, int]]) -> Iterator[tuple[tuple[str, int], Any]]:
-        log("imagining with true, shuffled and no actions …")
+        log(f"imagining with {', '.join(dict.fromkeys(kind for kind, _ in todo))} actions …")
         for key in todo:
             yield key, pieces.scores(*key)
 
@@ -268,7 +274,7 @@ class _Pieces:
         else:
             given = controls
             if kind == SHUFFLED:
-                given = self._others(first, context, controls)
+                given = self._others(first, controls)
             numbers, padded = np.arange(first, first + self.size), stack(given, self.size)
             if kind == WARP:
                 rgb = _warped(self.config, context, padded)
@@ -282,16 +288,15 @@ class _Pieces:
             found["lpips"] = np.concatenate([each.mean(1, keepdims=True), each], 1)
         return found | self._by_masks(context, rgb, first, count)
 
-    def _others(self, first: int, context: Frames, controls: Sequence[Any]) -> list[Any]:
+    def _others(self, first: int, controls: Sequence[Any]) -> list[Any]:
         """Return the controls of a batch's clips with the actions of clips in other houses."""
         found = []
         for k, own in enumerate(controls):
             choice, other = (x[first + k] for x in (self.walks.choices, self.walks.others))
             others = self._load(other)[2]
             if isinstance(own, Control):
-                pose = np.asarray(context.camera.world_from_camera[k, -1])
-                info = self.episodes[choice.episode].info
-                others = with_actions(self.config, info, pose, own, np.asarray(others.actions_TA))
+                episode, actions = self.episodes[choice.episode], np.asarray(others.actions_TA)
+                others = with_actions(self.config, episode, choice.start, own, actions)
             found.append(_arrays(others))
         return found
 
@@ -343,21 +348,17 @@ def _arrays(control: Any) -> Any:
 
 
 def with_actions(
-    config: Config,
-    info: Mapping[str, Any],
-    world_from_camera: np.ndarray,
-    own: Control,
-    actions_TA: np.ndarray,
+    config: Config, episode: Episode, start: int, own: Control, actions_TA: np.ndarray
 ) -> Control:
-    """Return a clip's control with other actions; its state stays.
+    """Return the control of a clip with other actions; its state stays.
 
     Its cameras stay, too, if the model does not see them; a model that gets the warped observed
     frame gets the cameras to which the actions lead.
 
     Args:
         config: the settings.
-        info: the episode's, with the size of the body.
-        world_from_camera: (4, 4) pose of the present camera.
+        episode: the clip's.
+        start: the present frame.
         own: the clip's control.
         actions_TA: the other actions.
 
@@ -366,18 +367,27 @@ def with_actions(
     """
     if not _warps(config):
         return dataclasses.replace(own, actions_TA=actions_TA)
-    about = info.get("body") or {}
-    body = BODIES.get(about.get("name", ""))
-    if body is None or own.state_A is None:
+    body, scale = _body_of(episode)
+    present = episode.world_from_camera[start]
+    poses = body.cameras_along(present, state_at(episode, start), actions_TA, scale)
+    camera = dataclasses.replace(own.camera, world_from_camera=poses)
+    return Control(camera, actions_TA, own.state_A)
+
+
+def _body_of(episode: Episode) -> tuple[Body, float]:
+    """Return the body of an episode's agent, and its size.
+
+    Raises:
+        UserError: it is unknown.
+    """
+    about = episode.info.get("body") or {}
+    if about.get("name") not in BODIES or episode.states is None:
         raise UserError(
             "this world renders the observed frame from the cameras to which actions lead, and "
             "those of recorded actions are known for a known body alone: use data collected with "
             "--body, or train with model.observed every."
         )
-    state = np.asarray(own.state_A)
-    poses = body.cameras_along(world_from_camera, state, actions_TA, about["scale"])
-    camera = dataclasses.replace(own.camera, world_from_camera=poses)
-    return Control(camera, actions_TA, own.state_A)
+    return BODIES[about["name"]], float(about["scale"])
 
 
 def _imagined(

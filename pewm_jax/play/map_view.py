@@ -148,7 +148,7 @@ class MapView:
         if image is not None:
             self._agent.image = image
         self._agent.visible = self.handle.visible = True
-        self.handle.position = place
+        self.handle.position = np.append(session.planar_3[:2], place[2])
         self.handle.wxyz = viser.transforms.SO3.from_z_radians(float(session.planar_3[2])).wxyz
         path = session.path_P3
         if len(path) > 1:

@@ -257,8 +257,9 @@ def _apply_edit(engine: Engine, session: Session, event: Erase | Move) -> Sessio
         done = "Copied" if event.leave else "Moved"
         said = f"{done} the box; the map has {len(engine.points(world)[0])} points."
     changed = dataclasses.replace(session, world=world)
-    seen = ahead(engine, changed, STILL)
-    return _next_session(engine, changed, seen, STILL, session.planar_3, said)
+    still = STILL if session.state_A is None else np.append(session.state_A[:-2], [0.0, 0.0])
+    seen, step = ahead(engine, changed, still), step_of(changed, still)
+    return _next_session(engine, changed, seen, step, session.planar_3, said)
 
 
 def about_middle(
@@ -308,7 +309,7 @@ def _initial_session(
     else:
         planar = np.array([camera[0, 3], camera[1, 3], float(heading(camera))], np.float64)
     if place.planar_3 is not None and np.allclose(planar[:2], place.planar_3[:2], atol=1e-4):
-        planar = place.planar_3.copy()  # exact: rounding could put the agent into a wall
+        planar[:2] = place.planar_3[:2]  # exact: rounding could put the agent into a wall
     path = camera[None, :3, 3]
     return Session(
         place, world, world, planar, path, seed=seed, said=said, state_A=state, wished_A=state

@@ -126,7 +126,8 @@ def imagine(
         control: n ≥ 1 steps, any number: (n,) discrete actions (0 forward, 1 turn left, 2 turn
             right); (n, 3) continuous ones (dx, dy, dyaw: metres forward, metres left, radians
             counter-clockwise); a ``Camera`` (n,) for the frames to imagine (six degrees of
-            freedom); or a ``Control`` with (n,) cameras and (n, A) actions.
+            freedom); or a ``Control`` with (n,) cameras and (n, A) actions and, for a model whose
+            control has a state, the (A,) state of the agent in the present frame.
         key: randomness of the sampling noise.
         remember: whether the imagined frames enter the memory.
         memory: False ignores the memory (the empty-memory baseline).

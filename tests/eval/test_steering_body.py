@@ -148,11 +148,17 @@ def test_without_a_known_body_it_is_unknown_where_other_actions_lead():
     choice = clips.choose(config(), episodes(), 3, 2)[1]
     control = clips.load_clip(config(), episodes(), choice)[2]
     actions = np.zeros_like(control.actions_TA)
+    episode = dataclasses.replace(episodes()[choice.episode], info={})
     with pytest.raises(UserError, match="known for a known body alone"):
-        steering.with_actions(config(), {}, np.eye(4), control, actions)
+        steering.with_actions(config(), episode, choice.start, control, actions)
+    plain = [dataclasses.replace(one, info={}) for one in episodes()]
+    choices = clips.choose(config(), plain, 3, 2)
+    steered, reason = steering.score(config(), {}, plain, choices, None, print)
+    assert steered is None
+    assert reason.startswith("Steering is not measured: this world renders the observed frame")
     model = dataclasses.replace(config().model, observed="every")
     unseen = dataclasses.replace(config(), model=model)
-    found = steering.with_actions(unseen, {}, np.eye(4), control, actions)
+    found = steering.with_actions(unseen, episode, choice.start, control, actions)
     assert found.camera is control.camera
     assert not np.any(found.actions_TA)
 

@@ -30,25 +30,26 @@ def base(data="data/none", preset="egowm"):
         data=dataclasses.replace(
             loaded.data, path=data, prepared=4, prepared_path="", refresh=0, context=2
         ),
-        train=dataclasses.replace(loaded.train, start="", adapt=stage, log_every=100),
+        train=dataclasses.replace(loaded.train, adapt=stage, log_every=100),
         evaluate=dataclasses.replace(loaded.evaluate, batch=2, lpips="off"),
     )
 
 
 def test_every_row_gives_its_actions_in_its_way_and_trains_one_stage():
-    study = Study(base(), Path("out"))
+    study = Study(base(preset="egowm_humanoid"), Path("out"))
+    assert study.base.train.start == "egowm"
     for name in ROWS:
         config = study.config(name, 1, 70)
-        assert config.train.seed == 1
+        assert (config.train.seed, config.train.start) == (1, "")
         assert config.train.run == str(Path("out/seed1") / name)
         steps = (config.train.video.steps, config.train.adapt.steps)
         assert steps == ((70, 0) if name == "none" else (0, 70))
         assert study.stage(name).settings(config).steps == 70
         assert config.model.control.inject == ("timestep" if name == "none" else name)
-        assert config.model.backbone == base().model.backbone
+        assert config.model.backbone == study.base.model.backbone
         assert (config.model.observed, config.train.denoised_lpips) == ("every", 0)
         assert (getattr(config.model.codec, "gate", 0), config.train.gate.steps) == (0, 0)
-    assert base().model.observed == "warped"
+    assert study.base.model.observed == "warped"
 
 
 def test_rows_get_as_many_steps_as_their_time_allows_and_it_is_measured_once(tmp_path, monkeypatch):
