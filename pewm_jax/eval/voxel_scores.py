@@ -7,8 +7,8 @@
 * **A known grid**: PSNR of the renderer given the recorded voxels and cameras.
 * **Long walks**: PSNR over the walk, FVD of all its windows of 16 frames. After it the camera is
   sent back to the observed frames: all pixels there were seen before, and the PSNR lost is that
-  against the same at the beginning of the walk. Doorways that the observed frames showed open must
-  still be passable in the world's grid.
+  against the same at the beginning of the walk, both without the images before. Doorways in the
+  window that the observed frames showed open must still be passable in the world's grid.
 
 Rows with one mechanism of the world switched off show what each contributes.
 """
@@ -36,7 +36,8 @@ from pewm_jax.houses.kinds import GROUPS
 from pewm_jax.io.progress import Meter
 from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import UNKNOWN, ClassGrid
-from pewm_jax.types import Array, Camera, Control, Frames, Params
+from pewm_jax.models.persist import voxel_renderer
+from pewm_jax.types import Array, Camera, Control, Frames, Params, WorldState
 from pewm_jax.worlds.persist import state as windows
 from pewm_jax.worlds.persist import voxel_frames
 
@@ -59,7 +60,7 @@ known cells persist as observed ones do. Without ``persistence_logit`` all voxel
 sampled, since cells that are not sampled persist too."""
 KNOWN_FRAMES = 32
 """Most frames of a walk that are rendered from a known grid."""
-PRIOR_HOUSES = 64
+PRIOR_HOUSES = 256
 """Most windows of other houses from which the mean layout is computed."""
 THRESHOLDS = np.linspace(0.02, 0.98, 49)
 WIDEST = 3
@@ -159,9 +160,7 @@ def compare_window(
     """
     model, recorded = config.model, episode.voxels([at])
     if low_3 is None or first_3 is None:
-        poses = np.asarray(seen.camera.world_from_camera)
-        low_3 = np.asarray(model.memory.empty(model, poses[0, :3, 3]).low_3)
-        first_3 = np.asarray(windows.first_cell(model, low_3, poses[-1, :3, 3]))
+        low_3, first_3 = _window_at(model, seen)
     off = np.round((low_3 - recorded.origin_T3[0]) / model.cell).astype(int) + first_3
     true = np.asarray(
         windows.cut_box(jnp.asarray(recorded.classes_TXYZ[0], jnp.int16), off, model.side)
@@ -171,6 +170,13 @@ def compare_window(
     walls = wall_classes(recorded.names)
     unseen = (true != UNKNOWN) & ~shown
     return UnseenCells(episode.scene, unseen, walls[np.maximum(true, 0)] & (true > 0))
+
+
+def _window_at(model: Any, seen: Frames) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest corner, metres, and first cell of the window after observed frames."""
+    poses = np.asarray(seen.camera.world_from_camera)
+    low_3 = np.asarray(model.memory.empty(model, poses[0, :3, 3]).low_3)
+    return low_3, np.asarray(windows.first_cell(model, low_3, poses[-1, :3, 3]))
 
 
 def _observed(episode: Episode, at: int, context: int) -> Frames:
@@ -316,7 +322,12 @@ def long_walks(
 
 
 def _look_back(config: Config, params: Params, state: Any, camera: Camera, key: Array) -> Array:
-    """Return the frames that a world imagines at cameras."""
+    """Return the frames that a world imagines at cameras, without the images before them."""
+    nets, grid = config.model.backbone, state.map
+    pictures = voxel_renderer.empty_cache(nets.renderer, 1, jnp.dtype(config.model.dtype))
+    if grid.history is not None:
+        history = dataclasses.replace(grid.history, pictures=pictures)
+        state = WorldState(state.frame, dataclasses.replace(grid, history=history))
     return worlds.imagine(config.model, params, state, Control(camera), key)[1].rgb_THWC
 
 
@@ -358,16 +369,16 @@ def cells_at(grid: ClassGrid, cell_m: float, points: np.ndarray) -> np.ndarray:
 
 
 def passable(config: Config, grid: ClassGrid, way: np.ndarray) -> bool:
-    """Return whether ``LANE`` lanes side by side are free in a grid."""
-    free = (cells_at(grid, config.model.cell, way) <= class_grid.EMPTY).all(1)
+    """Return whether ``LANE`` lanes side by side are empty in a grid; unknown cells are not."""
+    free = (cells_at(grid, config.model.cell, way) == class_grid.EMPTY).all(1)
     return bool(np.convolve(free, np.ones(LANE, int), "valid").max(initial=0) >= LANE)
 
 
 def open_doorways(config: Config, episode: Episode, at: int, context: int) -> list[np.ndarray]:
     """Return the ways through the true doorways that the frames before a walk show open.
 
-    A doorway counts if the recorded grid of the present frame, ``at``, lets one pass, and the
-    observed frames show at least half of the way empty.
+    A doorway counts if it lies in the world's window at the present frame, ``at``, the recorded
+    grid lets one pass, and the observed frames show at least half of the way empty.
     """
     house, model = house_of(episode.scene), config.model
     if house is None:
@@ -376,10 +387,13 @@ def open_doorways(config: Config, episode: Episode, at: int, context: int) -> li
     grid = ClassGrid(recorded.classes_TXYZ[0].astype(np.int16), recorded.origin_T3[0])
     seen = _observed(episode, at, context)
     floor = float(episode.world_from_camera[at][2, 3]) - model.memory.eye_m
+    low, first = _window_at(model, seen)
+    corner = low + first * model.cell
     found = []
     for *_, x0, y0, x1, y1 in house["doorways"]:
         way = way_through((x0, y0, x1, y1), floor, model.cell)
         known = cells_at(grid, model.cell, way) != UNKNOWN
+        known &= ((way >= corner) & (way < corner + model.side * model.cell)).all(-1)
         if known.all() and passable(config, grid, way):
             shown = _points_shown(seen, way)
             if shown.mean() >= SEEN_SHARE:

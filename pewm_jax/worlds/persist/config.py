@@ -58,11 +58,15 @@ class PersistTrainConfig(TrainSettings):
     occupied: float = 1.0
     """Weight of the error of latents with occupied cells; 1 as published. Most cells are air."""
     new: float = 1.0
-    """Weight of the error of latents with cells that the map does not hold yet, where
-    `world_frames.map_embed` is not 0: those are what the network has to complete."""
+    """Weight of the error of latents with cells that the map does not hold yet, or of which its
+    guess is wrong, where `world_frames.map_embed` is not 0: those are what the network has to
+    complete."""
     guessed: float = 0.5
     """Share of the clips whose map also holds guesses of the cells that were not observed: the true
     cells, parts of which are missing, moved or there twice. In the others these are unknown."""
+    elsewhere: float = 0.0
+    """Share of the clips with guesses in which these are the cells of another clip of the batch, as
+    wrong as a world's own guesses often are."""
     entering: float = 0.7
     """Share of the clips with guesses in which the cells at one side of the window are unknown, as
     where the agent walks on."""
@@ -80,7 +84,7 @@ class PersistTrainConfig(TrainSettings):
         require(self.classes >= 0, f"train.classes is {self.classes}: use 0 or more.")
         require(self.compared >= 1, f"train.compared is {self.compared}: use 1 or more.")
         require(self.new > 0, f"train.new is {self.new}: use a number above 0.")
-        for name in ("guessed", "entering"):
+        for name in ("guessed", "elsewhere", "entering"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"train.{name} is {value}: use a share, 0 to 1.")
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")

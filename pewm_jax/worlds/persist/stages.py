@@ -96,7 +96,7 @@ def world_frames(
     noise at any time; later frames do not read them, and their error does not count. With
     ``world_frames.map_embed`` a frame is also conditioned on a map of the cells observed up to it,
     with or without guesses of the others (``drawn_map``); the error of latents with cells that the
-    map does not hold weighs ``train.new`` times as much.
+    map does not hold, or guesses wrongly, weighs ``train.new`` times as much.
     """
     assert isinstance(train, PersistTrainConfig)
     made = _prepared(prepare.frames, model, params, clip)
@@ -108,8 +108,9 @@ def world_frames(
     if config.map_embed:
         map_key, velocity_key = jax.random.split(velocity_key)
         given = drawn_map(model, train, made, map_key)
-        states = given[1]
-        new = prepare.any_in_latent(model, states == voxel_dit.ABSENT)
+        ids, states = given
+        wrong = (states == voxel_dit.GUESS) & (ids != made["classes"])
+        new = prepare.any_in_latent(model, wrong | (states == voxel_dit.ABSENT))
         weight = weight * jnp.where(new, train.new, 1.0)
         read = known & grid_state.any_in_token(model, states == voxel_dit.SEEN)
     low, high = (at * config.patch for at in config.levels)
@@ -151,13 +152,14 @@ def drawn_map(
     """Return ids and states (B, T, X, Y, Z) of the maps that condition the frames of clips.
 
     The frames up to a drawn one are real: what they show is observed, and so are the cells of some
-    of the views before the clip. In some clips the other cells are guesses, the true cells with
-    errors (``corruption``), except, in some of these, at one side of the window.
+    of the views before the clip. In some clips the other cells are guesses: the true cells with
+    errors (``corruption``), or those of another clip; except, in some of these, at one side of the
+    window.
     """
     classes, frames = made["classes"].astype(jnp.int32), made["classes"].shape[1]
 
     def one(
-        classes: Array, seen: Array, before: Array, known: Array, key: Array
+        classes: Array, other: Array, seen: Array, before: Array, known: Array, key: Array
     ) -> tuple[Array, Array]:
         keys = jax.random.split(key, 6)
         last = jax.random.randint(keys[0], (), 0, frames)
@@ -172,7 +174,8 @@ def drawn_map(
             jax.random.bernoulli(k, p)
             for k, p in zip(keys[4:], (train.guessed, train.entering), strict=True)
         )
-        wrong = corruption.corrupt(classes[0], guess_key)
+        elsewhere = jax.random.bernoulli(jax.random.fold_in(guess_key, 1), train.elsewhere)
+        wrong = corruption.corrupt(jnp.where(elsewhere, other, classes[0]), guess_key)
         wrong = jnp.where(guesses, wrong, UNKNOWN)
         absent = guesses & entering & _side(model, side_key)
         ids = jnp.where(observed, cells, wrong)
@@ -190,7 +193,8 @@ def drawn_map(
     for axis in (-3, -2, -1):
         known = jnp.repeat(known, token, axis)
     keys = jax.random.split(key, len(classes))
-    return jax.vmap(one)(classes, made["seen"], made["before"], known, keys)
+    others = jnp.roll(classes[:, 0], 1, 0)
+    return jax.vmap(one)(classes, others, made["seen"], made["before"], known, keys)
 
 
 def _side(model: PersistModel, key: Array) -> Array:

@@ -24,7 +24,7 @@ from pewm_jax.data.voxels import PALETTE
 from pewm_jax.geometry import march
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
-from pewm_jax.memory.class_grid import EMPTY, OBSERVED, UNKNOWN
+from pewm_jax.memory.class_grid import EMPTY, GUESSED, OBSERVED, UNKNOWN
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.nn.layers import linear
@@ -50,9 +50,12 @@ def sample(
     ``history`` gives the action that leads to the frame and the image that conditions it, ``cache``
     those of the frames before. ``middle_3`` is the middle of the window, metres, ``before_XYZ`` are
     its previous cells, and ``mask_XYZ`` states where these come from (``memory.class_grid``).
-    ``evidence`` is that of a real image of this frame.
+    ``evidence`` is that of a real image of this frame. With it, cells that are mere guesses are
+    unknown if the map is an input: all of them are completed anew from what was observed.
     """
     config, noise = model.backbone.world_frames, model.voxel_noise
+    if config.map_embed and evidence is not None and mask_XYZ is not None:
+        before_XYZ = jnp.where(mask_XYZ == GUESSED, UNKNOWN, before_XYZ)
     asked = _condition(model, history, middle_3)
     if config.map_embed:
         ids, states = map_input(model, before_XYZ, mask_XYZ, evidence)

@@ -95,6 +95,64 @@ def test_guesses_may_change_and_what_was_observed_stays(params):
     assert not top[..., 7].any()
 
 
+@pytest.mark.slow
+def test_a_real_frame_completes_anew_what_was_only_guessed(params, monkeypatch):
+    """As if it had never been guessed; what was observed or shown is an input."""
+    given = []
+
+    def decode_classes(model, params, latents, before, *_):
+        given.append(np.asarray(before))
+        return before
+
+    before = jnp.full((8, 8, 8), 3, jnp.int16)
+    mask = jnp.zeros((8, 8, 8), jnp.uint8).at[:2].set(class_grid.OBSERVED)
+    mask = mask.at[2:4].set(class_grid.SHOWN)
+    world = jax.jit(worlds.start, static_argnums=0)(MASKED, params, seen())
+    history = world.map.history
+    monkeypatch.setattr(voxel_frames, "decode_classes", decode_classes)
+    none = voxel_frames.ObservedCells(jnp.zeros((8, 8, 8), bool), jnp.full((8, 8, 8), -1))
+    for evidence in (none, None):
+        voxel_frames.sample(
+            MASKED, params, history, history.voxels, jnp.zeros(3), before, KEY, evidence, mask
+        )
+    real, imagined = given
+    assert (real[:4] == 3).all()
+    assert (real[4:] == -1).all()
+    np.testing.assert_array_equal(imagined, before)
+
+
+def test_with_a_context_of_one_frames_are_predicted_alone():
+    nets = MASKED.backbone.world_frames
+    config = dataclasses.replace(nets, blocks=dataclasses.replace(nets.blocks, context=1))
+    net = weights(voxel_dit, config)
+    latents, times = normal(0, 1, 2, 4, 4, 4, 3), jnp.ones((1, 2))
+    told, actions, camera = normal(1, 1, 2, 4, 4, 88), normal(2, 1, 2, 3), normal(3, 1, 2, 10)
+    given = jnp.zeros((1, 2, 8, 8, 8), jnp.int32), jnp.ones((1, 2, 8, 8, 8), jnp.int32)
+
+    @jax.jit
+    def run(latents):
+        return voxel_dit.apply(
+            config, net, latents, times, actions, told, camera_BTN=camera, map_BTXYZ=given
+        )[0]
+
+    whole = run(latents)
+    np.testing.assert_array_equal(run(latents.at[:, 0].set(0.0))[:, 1], whole[:, 1])
+    cache = voxel_dit.empty_cache(config, 1, jnp.float32)
+    for k in range(2):
+        made, cache = voxel_dit.apply(
+            config,
+            net,
+            latents[:, k : k + 1],
+            times[:, :1],
+            actions[:, k : k + 1],
+            told[:, k : k + 1],
+            camera_BTN=camera[:, k : k + 1],
+            map_BTXYZ=jax.tree.map(lambda x, k=k: x[:, k : k + 1], given),
+            cache=cache,
+        )
+        np.testing.assert_allclose(made[:, 0], whole[:, k], atol=1e-5)
+
+
 def test_the_map_of_a_real_frame_has_its_evidence():
     before = jnp.full((8, 8, 8), -1, jnp.int16).at[0].set(2).at[1].set(4)
     mask = jnp.zeros((8, 8, 8), jnp.uint8).at[:1].set(class_grid.OBSERVED)
@@ -263,6 +321,12 @@ def test_a_map_in_training_holds_what_was_observed_and_guesses_or_nothing(made):
     assert (ids[:, :, :, None] == frames).any(3)[known].all()
     ids, states = (np.asarray(x) for x in draw(MASKED, full, made, keys))
     assert (states != voxel_dit.ABSENT).all()
+    other = dataclasses.replace(full, elsewhere=1.0)
+    ids, states = (np.asarray(x) for x in draw(MASKED, other, made, keys))
+    guess = (states == voxel_dit.GUESS)[:, :, 0]
+    swapped = np.broadcast_to(made["classes"][::-1, 0], guess.shape)
+    assert (ids[:, :, 0][guess] == swapped[guess]).mean() > 0.5
+    assert (ids[:, :, 0][guess] == swapped[:, ::-1][guess]).mean() < 0.3
     ids, states = (np.asarray(x) for x in draw(MASKED, open_, made, keys))
     share = (states == voxel_dit.ABSENT).mean((2, 3, 4, 5))
     assert ((share > 0.1) & (share < 0.6)).all()
@@ -288,6 +352,8 @@ def test_the_error_of_new_cells_weighs_more(made):
     )
     share = one / alone
     assert 0 < share < 0.9
+    wrong = dataclasses.replace(TRAIN, guessed=1.0, entering=0.0, elsewhere=1.0, new=1e6)
+    assert float(error(wrong)) > float(error(dataclasses.replace(wrong, new=1.0)))
     np.testing.assert_allclose(ten, alone * 10 * share / (1 + 9 * share), rtol=1e-3)
 
 
