@@ -15,10 +15,10 @@ def config() -> Config:
     They are those of ``egowm``, whose shipped weights training starts from, with another control:
     actions are the angles of the joints at the next frame with the linear and the angular velocity,
     and the initial state is a further input (Eq. 6). The observed frame is rendered from the
-    camera on the body's head, which follows from its joints; the arms in it do not stay where they
-    were, so the network erases and draws them. Its data: ``pewm-jax data collect data/humanoid
-    --body humanoid --train 1200 --validation 16 --test 48 --frames 72 --step_m 0.12 --turn_deg 10
-    --turn_around 0 --test_policy follow --ids``.
+    camera on the body's head, which follows from its joints, without the pixels of the body itself.
+    The bones of its arms are drawn into further input channels (``control.drawn``). Its data:
+    ``pewm-jax data collect data/humanoid --body humanoid --train 1200 --validation 16 --test 48
+    --frames 72 --step_m 0.12 --turn_deg 10 --turn_around 0 --test_policy follow --ids``.
     """
     base, size = egowm.config(), HUMANOID.size
     assert isinstance(base.train, EgoWMTrainConfig)
@@ -30,10 +30,11 @@ def config() -> Config:
         high=tuple(HUMANOID.high.tolist()),
         angles=(),
         body="humanoid",
+        drawn=True,
     )
     return dataclasses.replace(
         base,
-        model=dataclasses.replace(base.model, control=control),
+        model=dataclasses.replace(base.model, control=control, own_m=0.55),
         data=dataclasses.replace(
             base.data, path="data/humanoid", prepared_path="data/humanoid_prepared"
         ),
@@ -42,6 +43,7 @@ def config() -> Config:
             run="runs/egowm_humanoid",
             start="egowm",
             fresh=("control/.*",),
-            adapt=dataclasses.replace(base.train.adapt, steps=1500),
+            wider=("backbone/into/kernel",),
+            adapt=dataclasses.replace(base.train.adapt, steps=1200),
         ),
     )

@@ -17,6 +17,11 @@ _BACK, _OUT = (0.0, -1.0, 0.0), {"left": X, "right": (-1.0, 0.0, 0.0)}
 """Axes about which an arm rises to the front, and to its own side."""
 ARM_LINKS = ("upper_arm", "forearm", "hand", "fingers", "thumb")
 """The visible links of an arm; their names begin with the side."""
+BONES = (
+    (("upper_arm", "forearm"), ("forearm", "hand")),
+    (("hand", "fingers"), ("fingers", "tip"), ("hand", "thumb")),
+)
+"""Bones of an arm, and of a hand."""
 
 
 def _freedoms() -> tuple[Freedom, ...]:
@@ -74,6 +79,7 @@ def _arm(side: str) -> tuple[Joint, ...]:
             own("hand_closure"),
             1.6,
         ),
+        joint("tip", own("fingers"), (0.0, 0.0, -0.09)),
         joint(
             "thumb",
             own("hand"),
@@ -105,6 +111,14 @@ def _body() -> Body:
         ),
         eyes="eyes",
         arms=tuple(f"{side}_{link}" for side in ("left", "right") for link in ARM_LINKS),
+        bones=tuple(
+            tuple(
+                (f"{side}_{one}", f"{side}_{other}")
+                for side in ("left", "right")
+                for one, other in group
+            )
+            for group in BONES
+        ),
     )
 
 

@@ -11,7 +11,10 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from pewm_jax.errors import UserError, require
@@ -75,6 +78,8 @@ class Body:
         joints: its joints, parents first.
         eyes: the link that carries the camera, at its origin, looking along x.
         arms: the links that are arms or hands.
+        bones: groups of pairs of links; a bone goes from the origin of the one to that of the
+            other.
 
     Raises:
         ConfigError: the list is inconsistent.
@@ -85,6 +90,7 @@ class Body:
     joints: tuple[Joint, ...]
     eyes: str
     arms: tuple[str, ...] = ()
+    bones: tuple[tuple[tuple[str, str], ...], ...] = ()
 
     def __post_init__(self):
         """Validate."""
@@ -113,7 +119,8 @@ class Body:
                 abs(length - 1) < 1e-6,
                 f"body {self.name}: the axis of joint {joint.name} has length {length:.3g}, not 1.",
             )
-        for link in (self.eyes, *self.arms):
+        ends = [link for group in self.bones for bone in group for link in bone]
+        for link in (self.eyes, *self.arms, *ends):
             require(link in names, f"body {self.name} has no link {link!r}.")
         for one in self.freedoms:
             require(
@@ -173,20 +180,40 @@ class Body:
                 f"body {self.name} got positions of shape {planar.shape} and states of shape "
                 f"{state.shape}: give (T, 3) and (T, {self.size})."
             )
-        made = np.empty((len(planar), len(self.joints), 4, 4))
-        base = np.tile(np.eye(4), (len(planar), 1, 1))
-        base[:, :3, :3] = _turn((0.0, 0.0, 1.0), planar[:, 2])
-        base[:, :2, 3] = planar[:, :2]
-        places = {name: k for k, name in enumerate(self.links)}
-        for k, joint in enumerate(self.joints):
-            step = np.tile(np.eye(4), (len(planar), 1, 1))
-            step[:, :3, 3] = scale * np.array(joint.origin)
-            if joint.freedom:
-                angle = joint.gain * state[:, self.index(joint.freedom)]
-                step[:, :3, :3] = _turn(joint.axis, angle)
-            parent = base if not joint.parent else made[:, places[joint.parent]]
-            made[:, k] = parent @ step
+        turns, places = self._chain(state)
+        made = np.tile(np.eye(4), (len(planar), len(self.joints), 1, 1))
+        base = _turn((0.0, 0.0, 1.0), planar[:, 2])[:, None]
+        made[..., :3, :3] = base @ turns
+        made[..., :3, 3] = (base @ (scale * places)[..., None])[..., 0]
+        made[..., :2, 3] += planar[:, None, :2]
         return made
+
+    def seen_places(self, state_BA: jax.Array) -> jax.Array:
+        """Return (..., L, 3) the origins of all links in the frame of the camera, metres; jittable.
+
+        x is right, y down and z forward; the body has a scale of 1.
+        """
+        turns, places = self._chain(jnp.asarray(state_BA))
+        eye = self.links.index(self.eyes)
+        off = places - places[..., eye : eye + 1, :]
+        return jnp.einsum("...li,...ij->...lj", off, turns[..., eye, :, :] @ OPTICAL[:3, :3])
+
+    def _chain(self, state: Any) -> tuple[Any, Any]:
+        """Return rotations (..., L, 3, 3) and origins (..., L, 3) of links in the body's frame.
+
+        NumPy arrays give NumPy arrays.
+        """
+        xp = np if isinstance(state, np.ndarray) else jnp
+        found: dict[str, tuple[Any, Any]] = {"": (np.eye(3), np.zeros(3))}
+        still = xp.zeros(state.shape[:-1])
+        for joint in self.joints:
+            turn, place = found[joint.parent]
+            angle = joint.gain * state[..., self.index(joint.freedom)] if joint.freedom else still
+            place = place + turn @ np.array(joint.origin)
+            found[joint.name] = turn @ _turn(joint.axis, angle), place
+        turns, places = zip(*[found[name] for name in self.links], strict=True)
+        places = [xp.broadcast_to(place, (*state.shape[:-1], 3)) for place in places]
+        return xp.stack(turns, -3), xp.stack(places, -2)
 
     def world_from_camera(
         self,
@@ -256,11 +283,12 @@ class Body:
         return float(pose[0, 2, 3])
 
 
-def _turn(axis: Sequence[float], angle_T: np.ndarray) -> np.ndarray:
-    """Return (T, 3, 3) rotations about a unit axis (Rodrigues)."""
+def _turn(axis: Sequence[float], angle_T: Any) -> Any:
+    """Return (..., 3, 3) rotations about a unit axis (Rodrigues)."""
+    xp = np if isinstance(angle_T, np.ndarray | np.floating) else jnp
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    sin, cos = np.sin(angle_T)[:, None, None], np.cos(angle_T)[:, None, None]
+    sin, cos = xp.sin(angle_T)[..., None, None], xp.cos(angle_T)[..., None, None]
     return np.eye(3) + sin * cross + (1 - cos) * (cross @ cross)
 
 

@@ -37,11 +37,14 @@ class AssembledModel(World):
     A backbone denoises the latents of a codec, steered by a control; a reader reads a memory.
 
     Attributes:
+        own_m: observed pixels nearer than this show the agent's own body and are not warped; a
+            setting of the world, metres.
         observed: where the observed frame conditions a clip, a ``WhereObserved``; a setting of the
             worlds that declare this field.
     """
 
     observed = "first"  # without an annotation this is no field
+    own_m = 0.0
 
     clip: ClipConfig = ClipConfig()
     """Shape of a clip."""

@@ -247,6 +247,9 @@ class TrainSettings:
     fresh: tuple[str, ...] = (r"memory/.*",)
     """Parameter paths (regular expressions) that may be missing from the weights a stage starts
     from, or have another shape there; these parameters start at random."""
+    wider: tuple[str, ...] = ()
+    """Kernels (regular expressions of their paths) that may have more input channels than in the
+    weights a stage starts from: the further ones, which are the last, start at zero."""
     image_noise_mean: float = -3.0
     """Mean of log σ of the noise added to the observed first frame."""
     image_noise_std: float = 0.5
@@ -306,6 +309,8 @@ class TrainSettings:
         self._require_known_logs()
         for pattern in self.fresh:
             require(is_pattern(pattern), f"train.fresh: {pattern!r} is no regular expression.")
+        for pattern in self.wider:
+            require(is_pattern(pattern), f"train.wider: {pattern!r} is no regular expression.")
 
     def _require_known_logs(self) -> None:
         """Refuse an unknown log, one that is named twice, and `none` beside others."""

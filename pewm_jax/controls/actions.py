@@ -26,8 +26,9 @@ from jax.sharding import PartitionSpec as P
 
 from pewm_jax.bodies.humanoid import BODIES
 from pewm_jax.bodies.kinematics import WALKING
+from pewm_jax.codecs.pixel import fold
 from pewm_jax.config.parts import Conditioner, Rules
-from pewm_jax.controls import camera
+from pewm_jax.controls import camera, skeleton
 from pewm_jax.errors import UserError, require, require_positive
 from pewm_jax.models.interface import Conditioning
 from pewm_jax.nn.layers import linear, sinusoid
@@ -82,15 +83,21 @@ class ModulationConfig(Conditioner):
     body: Literal["", "humanoid"] = ""  # type: ignore[assignment]
     """The body whose degrees of freedom the actions are (`data collect --body`): the viewer then
     has a slider for each of them. Empty: the actions are of no known body."""
+    drawn: bool = False
+    """Also concatenate drawings of the body's arms to the input, as its camera sees them at each
+    frame (``controls.skeleton``); it needs `body` and `state`. Not part of the paper."""
     rays: bool = False
     """Also concatenate the cameras' Plücker rays to the input, as the control `camera` does."""
     rate: float = 10.0  # type: ignore[assignment]
     """Factor of the learning rate of these layers, which are new in a pre-trained model."""
 
     def channels(self, model: Any) -> int:
-        """Return the channels of the rays and of the actions, if they are joined."""
-        rays = 6 * model.codec.temporal if self.rays else 0
-        return rays + CHANNELS * (self.inject == "channels")
+        """Return the channels of rays, actions and drawings, if they are joined."""
+        codec = model.codec
+        rays = 6 * codec.temporal if self.rays else 0
+        groups = len(BODIES[self.body].bones) if self.drawn else 0
+        drawings = groups * codec.temporal * codec.spatial**2
+        return rays + CHANNELS * (self.inject == "channels") + drawings
 
     def check(self, model: Any) -> None:
         """Refuse a backbone that attends to no further tokens, if the actions are tokens."""
@@ -139,6 +146,11 @@ class ModulationConfig(Conditioner):
         require(
             self.body in ("", *BODIES),
             f"control.body is {self.body!r}: use {' or '.join(BODIES)}, or leave it empty.",
+        )
+        require(
+            not self.drawn or bool(self.body and self.state),
+            "control.drawn draws the arms of a known body from its states: set control.body and "
+            "control.state, or control.drawn false.",
         )
         size = BODIES[self.body].size if self.body else self.actions
         require(
@@ -199,15 +211,36 @@ class ModulationConfig(Conditioner):
                 state = self._waves(state)
             state = linear(params["state_2"], jax.nn.silu(linear(params["state_1"], state)))
             led = led + state[:, None]
-        rays = camera.rays(model, control.camera) if self.rays else None
+        parts = [camera.rays(model, control.camera)] if self.rays else []
+        if self.inject == "channels":
+            made = linear(params["inject"], jax.nn.silu(led))[:, :, None, None]
+            parts.append(jnp.broadcast_to(made, (len(made), *model.latent_shape, made.shape[-1])))
+        if self.drawn:
+            parts.append(self._drawings(model, control, observed_frames))
+        joined = jnp.concatenate(parts, -1) if parts else None
         if self.inject == "timestep":
-            return Conditioning(joined_BthwC=rays, modulation_BtE=led)
+            return Conditioning(joined_BthwC=joined, modulation_BtE=led)
         if self.inject == "attention":
-            return Conditioning(joined_BthwC=rays, tokens_BLC=self._tokens(params, led))
-        made = linear(params["inject"], jax.nn.silu(led))[:, :, None, None]
-        made = jnp.broadcast_to(made, (len(made), *model.latent_shape, made.shape[-1]))
-        joined = made if rays is None else jnp.concatenate([rays, made], -1)
+            return Conditioning(joined_BthwC=joined, tokens_BLC=self._tokens(params, led))
         return Conditioning(joined_BthwC=joined)
+
+    def _drawings(self, model: Any, control: Control, observed: int) -> Array:
+        """Return the drawings of the arms at the latent rate.
+
+        All observed frames have that of the last one, whose state is known.
+        """
+        state, actions = control.state_A, control.actions_TA
+        assert state is not None
+        assert actions is not None
+        states = jnp.concatenate([state[:, None], actions], 1)
+        states = jnp.where(
+            (np.arange(states.shape[1]) >= observed)[:, None], states, state[:, None]
+        )
+        size, codec = model.clip, model.codec
+        made = skeleton.draw_bones(
+            BODIES[self.body], states, control.camera.intrinsics_4, size.height, size.width
+        )
+        return fold(made, codec.spatial, codec.temporal)
 
     def _tokens(self, params: Params, led_BtE: Array) -> Array:
         """Return a token for each latent frame, which contains the number of the frame."""

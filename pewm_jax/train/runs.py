@@ -62,6 +62,7 @@ MUTABLE_FIELDS = (
     "train.keep_every",
     "train.mesh",
     "train.fresh",
+    "train.wider",
     "train.on_nonfinite",
     "train.grace_s",
     "train.log_every",

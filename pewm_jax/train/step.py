@@ -88,7 +88,8 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Par
 
     Leaves that match ``train.fresh`` may be missing and are initialized randomly: the memory blocks
     of stage 2, which the weights of stage 1 do not contain. Those of another shape are left out,
-    such as the control of other actions. Leaves that serve training alone may be missing, too; no
+    such as the control of other actions. Kernels that match ``train.wider`` may have fewer inputs:
+    the further ones are zero. Leaves that serve training alone may be missing, too; no
     weights contain them. ``start`` and ``like``, all parameters of the stage, may be their shapes.
 
     Raises:
@@ -96,7 +97,9 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Par
     """
     parameters = tree.flatten(like)
     leaves = {
-        path: leaf
+        path: _wider(leaf, parameters[path])
+        if path in parameters and lora.matches(config.train.wider, path)
+        else leaf
         for path, leaf in tree.flatten(start).items()
         if path not in parameters
         or np.shape(leaf) == np.shape(parameters[path])
@@ -112,6 +115,21 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Par
     what = f"Initial weights of {stage.title} (may lack, by train.fresh: {allowed})"
     tree.require_like(leaves, wanted, what)
     return tree.unflatten(leaves)
+
+
+def _wider(leaf: Any, like: Any) -> Any:
+    """Return a kernel with as many inputs as another one's, the further ones zero, if it has fewer.
+
+    Shapes give shapes.
+    """
+    have, want = np.shape(leaf), np.shape(like)
+    if len(have) < 2 or (*have[:-2], have[-1]) != (*want[:-2], want[-1]) or have[-2] >= want[-2]:
+        return leaf
+    if isinstance(leaf, jax.ShapeDtypeStruct):
+        return jax.ShapeDtypeStruct(want, leaf.dtype)
+    more = [(0, 0)] * len(have)
+    more[-2] = (0, want[-2] - have[-2])
+    return jnp.pad(leaf, more) if isinstance(leaf, jax.Array) else np.pad(leaf, more)
 
 
 def update_ema(ema: Params, trained: Params, step: Array, decay: float) -> Params:

@@ -142,7 +142,10 @@ def splatted(model: AssembledModel, observed: Frames, camera: Camera) -> View:
 
 
 def _splatted(model: AssembledModel, observed: Frames, camera: Camera) -> View:
-    """Render the pixels of one clip's observed frames."""
+    """Render the pixels of one clip's observed frames, without the agent's own body."""
+    if model.own_m:
+        depth = jnp.where(observed.depth_THW < model.own_m, 0, observed.depth_THW)
+        observed = dataclasses.replace(observed, depth_THW=depth)
     return rendering.splat_frames(observed, camera, model.clip.height, model.clip.width)
 
 

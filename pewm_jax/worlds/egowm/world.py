@@ -107,6 +107,9 @@ class EgoWM(AssembledModel):
     """Frames at the beginning of every clip that are observed, or were imagined before: 1 in Stable
     Video Diffusion and CogVideoX; more if the backbone is trained with more. They fill latent
     frames: with `codec.temporal` 4, use 4k + 1."""
+    own_m: float = 0.0
+    """Observed pixels nearer than this are not warped, metres: they show the agent's own body,
+    which moves with it."""
     observed: WhereObserved = "first"
     """Where the observed frames condition a chunk. `first`: at their latent frames. `every`: the
     last one's latents at every latent frame. `warped`: their colour and depth, rendered from each
