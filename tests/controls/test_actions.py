@@ -5,13 +5,18 @@ import functools
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pewm_jax.bodies.humanoid import HUMANOID
 from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import ConfigError, UserError
 from pewm_jax.controls import actions as action_control
+from pewm_jax.controls import skeleton
 from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.data.agent import open_agent
+from pewm_jax.data.render import Rendered
 from pewm_jax.memory.none import NoMemoryConfig
 from pewm_jax.models import interface as backbones
 from pewm_jax.readers.render import RenderConfig
@@ -147,9 +152,52 @@ def test_rays_are_joined_where_they_are_asked_for():
     assert steered(model_of(), actions_of(model)).joined_BthwC is None
 
 
+def test_arms_are_drawn_where_they_are_seen():
+    """In frames of a body without anything behind: most of the arms, and little beside them."""
+    agent = open_agent("humanoid", 1.25)
+    rng = np.random.default_rng(6)
+    names = [one.name for one in HUMANOID.freedoms]
+    states = np.tile(HUMANOID.rest, (8, 1))
+    for name, low, high in (("shoulder_pitch", 0.5, 1.2), ("elbow_pitch", 0.3, 1.2)):
+        for side in ("left", "right"):
+            states[:, names.index(f"{side}_{name}")] = rng.uniform(low, high, 8)
+    size, still = 48, np.zeros((8, 3))
+    intrinsics = np.array([30, 30, 24, 24], np.float32)
+    camera = agent.camera(still, states, np.tile(intrinsics, (8, 1)), 0.0)
+    empty = Rendered(
+        np.zeros((8, size, size, 3), np.uint8),
+        np.full((8, size, size), 50, np.float32),
+        np.zeros((8, size, size), np.uint16),
+    )
+    agent.render_over(empty, still, states, camera, 0.0, 1)
+    arms = np.isin(empty.ids_THW, [agent.ids(1)[link] for link in HUMANOID.arms])
+    assert 0.05 < arms.mean() < 0.5
+    states = jnp.asarray(states, jnp.float32)[None]
+    draw = jax.jit(skeleton.draw_bones, static_argnums=(0, 3, 4))
+    drawn = np.asarray(draw(HUMANOID, states, intrinsics[None, None].repeat(8, 1), size, size))
+    assert drawn.shape == (1, 8, size, size, 2)
+    assert 0 <= drawn.min() <= drawn.max() <= 1
+    found = drawn[0].max(-1) > 0.4
+    assert (found & arms).sum() / (found | arms).sum() > 0.6
+
+
+def test_drawings_are_joined_and_those_of_observed_frames_have_the_known_state():
+    settings = {"actions": 25, "state": 25, "angles": (), "body": "humanoid", **WIDE}
+    model = model_of(temporal=1, drawn=True, **settings)
+    assert model.in_channels == model_of(temporal=1, **settings).in_channels + 2 * 4 * 4
+    actions, state = actions_of(model), actions_of(model, 1)[:, 0]
+    made = steered(model, actions, state=state, observed=3)
+    assert made.joined_BthwC.shape == (BATCH, *model.latent_shape, 32)
+    np.testing.assert_array_equal(made.joined_BthwC[:, 0], made.joined_BthwC[:, 2])
+    other = steered(model, 0 * actions, state=state, observed=3)
+    np.testing.assert_array_equal(other.joined_BthwC[:, :3], made.joined_BthwC[:, :3])
+    assert (np.asarray(other.joined_BthwC[:, 3:]) != np.asarray(made.joined_BthwC[:, 3:])).any()
+
+
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
+        ({"drawn": True, "state": 3}, "set control.body and control.state"),
         ({"actions": 2}, "control.units has 3 values and control.actions is 2"),
         ({"low": (1.0, 4.0, -1.0)}, "each low must be below its high"),
         ({"units": (1.0, 0.0, 1.0)}, "use positive numbers"),

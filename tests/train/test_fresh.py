@@ -70,6 +70,25 @@ def test_of_another_shape_may_be_what_may_be_absent(whole):
         create(other, fresh=())
 
 
+def test_kernels_may_get_further_inputs_which_begin_at_zero(whole):
+    kernel = whole["backbone"]["kernel"]
+    fewer = {**whole, "backbone": {**whole["backbone"], "kernel": kernel[:-1]}}
+    made = create(fewer, wider=("backbone/kernel",)).params["backbone"]["kernel"]
+    np.testing.assert_array_equal(made[:-1], kernel[:-1])
+    np.testing.assert_array_equal(made[-1], 0)
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), fewer)
+    config = fakes.config(wider=("backbone/kernel",))
+    assert (
+        state.require_start(config, TWO, shapes, whole)["backbone"]["kernel"].shape == kernel.shape
+    )
+    more = {**whole, "backbone": {**whole["backbone"], "kernel": np.concatenate([kernel] * 2)}}
+    for start, changes in ((fewer, {}), (more, {"wider": ("backbone/kernel",)})):
+        with pytest.raises(tree.TreeError, match="backbone/kernel has shape"):
+            create(start, **changes)
+    with pytest.raises(ConfigError, match=r"train\.wider: '\(' is no regular expression"):
+        fakes.config(wider=("(",))
+
+
 def test_the_rule_is_known_before_anything_is_computed(whole):
     shapes = jax.eval_shape(functools.partial(fakes.init, None), KEY)
     config = fakes.config()

@@ -138,6 +138,19 @@ def test_holes_are_masked():
     np.testing.assert_array_equal(away[:, 1:], 0)
 
 
+def test_the_agents_own_body_is_not_warped():
+    clip = model_of("warped").clip
+    model = dataclasses.replace(EgoWM(), clip=clip, codec=EACH, observed="warped", own_m=1.0)
+    frame, camera = observed_frame()
+    depth = jnp.full_like(frame.depth_THW, 3.0).at[..., 12:].set(0.9)
+    near = dataclasses.replace(frame, depth_THW=depth)
+    found = everywhere(model, {}, near, unmoved(camera))
+    np.testing.assert_array_equal(found[..., :3, -1], 1)
+    np.testing.assert_array_equal(found[..., 3:, :], 0)
+    whole = everywhere(dataclasses.replace(model, own_m=0.0), {}, near, unmoved(camera))
+    np.testing.assert_array_equal(whole[..., 3:, -1], 1)
+
+
 def test_warped_frames_are_where_the_camera_sees_them():
     """A camera that moves forward by z sees the middle of the frame at a depth z less."""
     model = model_of("warped")
