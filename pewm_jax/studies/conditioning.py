@@ -4,9 +4,9 @@ Rows: the actions added to the time embedding (the paper), as further tokens tha
 attends to, as further input channels, and a model that was trained without actions; beside them the
 observed frame, repeated. Every row has the same codec, network, data, seed and clips. Each gets as
 many steps as its time allows (``step_times``). A warped observed frame would tell every row how the
-agent moves, so all get it as it is instead (``model.observed every``, no gate); LPIPS is not in
-their loss, since the stage without actions cannot have it. Trained rows and scores are stored, so
-that the same command resumes.
+agent moves, and so would drawn arms, so all get it as it is instead (``model.observed every``, no
+gate, no ``control.drawn``); LPIPS is not in their loss, since the stage without actions cannot have
+it. Trained rows and scores are stored, so that the same command resumes.
 """
 
 from __future__ import annotations
@@ -101,7 +101,8 @@ class Study:
         base, train = self.base, self.base.train
         assert isinstance(train, EgoWMTrainConfig)
         inject = "timestep" if name == "none" else name
-        control = dataclasses.replace(base.model.control, inject=inject)
+        assert isinstance(base.model.control, ModulationConfig)
+        control = dataclasses.replace(base.model.control, inject=inject, drawn=False)
         trained = dataclasses.replace(train.adapt, steps=steps)
         skipped = dataclasses.replace(train.adapt, steps=0)
         stages = (trained, skipped) if name == "none" else (skipped, trained)

@@ -231,7 +231,7 @@ def test_what_steers_decides_who_can_drive():
     assert config().model.capabilities.body == "humanoid"
     assert not config().model.capabilities.actions
     nameless = dataclasses.replace(
-        config().model, control=dataclasses.replace(config().model.control, body="")
+        config().model, control=dataclasses.replace(config().model.control, body="", drawn=False)
     )
     with pytest.raises(UserError, match="neither planar actions"):
         engine.open_engine("x", dataclasses.replace(config(), model=nameless), {})
