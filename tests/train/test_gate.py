@@ -276,7 +276,7 @@ def test_lpips_counts_in_the_codecs_gate_stage(tmp_path):
 def test_without_a_gate_there_is_nothing_to_learn():
     config = tiny_config()
     with pytest.raises(UserError, match=r"train\.gate\.steps is above 0, but this model has no"):
-        LAST.prepare(config.model, {}, batch(config, 1))
+        LAST.require(config.model)
     train = dataclasses.replace(config.train, gate=StageConfig(steps=1))
     with pytest.raises(UserError, match=r"this model has no gate"):  # before stage 1
         runs.planned(dataclasses.replace(config, train=train))
