@@ -57,6 +57,12 @@ def _in_one_form(model: World, present: Camera, control: Any) -> Control:
                 f"({count}, A): action k leads to camera k."
             )
         state = None if control.state_A is None else jnp.asarray(control.state_A)
+        if state is not None and actions is not None and state.shape != actions.shape[1:]:
+            raise UserError(
+                f"imagine() got a state of shape {state.shape} and actions of shape "
+                f"{actions.shape}; give a state of as many numbers as an action has, "
+                f"{actions.shape[1:]}: that of the present frame."
+            )
         return Control(_as_arrays(control.camera), actions, state)
     if isinstance(control, Camera):
         _require_cameras(control)

@@ -10,14 +10,14 @@ import pytest
 
 from pewm_jax import presets, worlds
 from pewm_jax.codecs.pixel import PixelConfig
-from pewm_jax.config import ClipConfig, Config, ConfigError
+from pewm_jax.config import ClipConfig, Config, ConfigError, UserError
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.types import Clip, Control
 from pewm_jax.worlds import world_model
-from pewm_jax.worlds.control import cut_into_clips
+from pewm_jax.worlds.control import control_of, cut_into_clips
 from pewm_jax.worlds.egowm.world import EgoWM, EgoWMTrainConfig, gated
 from pewm_jax.worlds.pewm import candidates
 from tests.helpers import random_camera, random_frames, randomised
@@ -169,6 +169,15 @@ def test_a_body_stands_still_where_a_clip_has_no_actions():
     many = jax.tree.map(lambda x: jnp.asarray(x)[None], asked)
     last = candidates.clip_control(many, slice(2, 3), 2, control.still)
     np.testing.assert_allclose(last.actions_TA[0], [actions[2], held], atol=1e-6)
+
+
+def test_a_state_of_another_size_is_refused():
+    model = presets.load("egowm_humanoid").model
+    cameras, actions = random_camera(np.random.default_rng(5), 3, 16, 16), np.zeros((3, 25))
+    present = jax.tree.map(lambda x: x[:1], cameras)
+    for state in (np.zeros(3), np.zeros((1, 25))):
+        with pytest.raises(UserError, match=r"got a state of shape .* that of the present frame"):
+            control_of(model, present, Control(cameras, actions, state))
 
 
 def test_training_has_the_state_of_the_last_observed_frame(monkeypatch):
