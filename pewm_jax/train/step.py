@@ -89,8 +89,8 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Par
     Leaves that match ``train.fresh`` may be missing and are initialized randomly: the memory blocks
     of stage 2, which the weights of stage 1 do not contain. Those of another shape are left out,
     such as the control of other actions. Kernels that match ``train.wider`` may have fewer inputs:
-    the further ones are zero. Leaves that serve training alone may be missing, too; no
-    weights contain them. ``start`` and ``like``, all parameters of the stage, may be their shapes.
+    the further ones are zero. Leaves that serve training alone may be missing, too; no weights
+    contain them. ``start`` and ``like``, all parameters of the stage, may be their shapes.
 
     Raises:
         TreeError: another leaf is missing, a leaf is unexpected or has another shape; lists them.
