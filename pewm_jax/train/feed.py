@@ -291,6 +291,7 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
     # The only values of earlier versions, whose prepared clips are still used.
     earlier = (reader, "picture", "pixels"), (model, "observed", "first")
     earlier = (*earlier, (model.get("noise", {}), "rendered_until", 0.0))
+    earlier = (*earlier, (model, "own_m", 0.0), (control, "drawn", False))
     if model.get("codec", {}).get("kind") == "pixel":
         earlier = (*earlier, (model["codec"], "gate", 0))
     for section, setting, value in earlier:

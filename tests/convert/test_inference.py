@@ -199,7 +199,7 @@ def test_the_card_of_a_body_says_how_it_is_steered_and_how_well():
     card = inference.write_card(facts)
     assert "state, control, jax.random.key(0)" in card
     assert "(n, 25) actions of the body `humanoid`, (25,) state of the agent" in card
-    assert "given a frame and an agent's actions" in card
+    assert "given an RGB-D frame and an agent's actions" in card
     assert "with no memory, codec `pixel`." in card
     assert "1 to 1 actions a frame." in card  # no earlier frames
     assert "With other actions (48 clips, 40 % of whose steps go forward):" in card

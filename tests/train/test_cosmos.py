@@ -65,7 +65,7 @@ STAGE = StageConfig(steps=4, batch=2, warmup=0, learning_rate=1e-3)
 def stepped():
     train = EgoWMTrainConfig(adapt=STAGE, mesh=MeshConfig())
     config = Config(model=MODEL, data=DataConfig(context=1), train=train)
-    *_, stage = worlds.stages(MODEL)
+    stage = worlds.stages(MODEL)[1]
     return config, stage, *trained(config, stage)
 
 
@@ -88,7 +88,7 @@ def test_its_sums_are_those_of_the_compiled_step(stepped):
 def test_every_leaf_has_its_place_on_many_devices():
     config = Config(model=MODEL, train=EgoWMTrainConfig(adapt=STAGE))
     mesh = jax.sharding.AbstractMesh((1, 4, 2, 1), ("data", "fsdp", "tensor", "context"))
-    *_, stage = worlds.stages(MODEL)
+    stage = worlds.stages(MODEL)[1]
     shapes = jax.eval_shape(functools.partial(state.create, config, stage), jax.random.key(0))
     placed = tree.flatten(sharding.of_state(MODEL, mesh, shapes))
     for path, leaf in tree.flatten(shapes).items():
@@ -113,7 +113,7 @@ def test_frames_that_are_given_do_not_count_in_the_loss(monkeypatch):
             return jnp.zeros_like(noisy).at[:, wrong_at].add(3.0)
 
         monkeypatch.setattr(world_model, "apply", predicted)
-        *_, stage = worlds.stages(MODEL)
+        stage = worlds.stages(MODEL)[1]
         return float(stage.loss(MODEL, config.train, params, batch, jax.random.key(0))[0])
 
     right, at_given, at_other = (loss(where) for where in (slice(0, 0), 0, 1))

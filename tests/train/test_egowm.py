@@ -85,7 +85,7 @@ def svd():
     config = Config(
         model=SVD, data=DataConfig(context=1), train=EgoWMTrainConfig(adapt=STAGE, blind=0.3)
     )
-    _, stage = worlds.stages(SVD)
+    stage = worlds.stages(SVD)[1]
     return config, stage, *trained(config, stage)
 
 
@@ -101,9 +101,10 @@ def test_the_u_net_learns_with_actions_and_the_rest_stands_still(svd):
 @pytest.mark.slow
 def test_a_video_model_is_made_first_where_there_is_none_and_the_control_waits(svd):
     _, _, first, *_ = svd
-    video, adapt = worlds.stages(SVD)
-    assert (video.number, adapt.number, video.optional, adapt.optional) == (1, 2, True, False)
-    assert EgoWMTrainConfig().video.steps == 0
+    video, adapt, gate = worlds.stages(SVD)
+    assert [stage.number for stage in (video, adapt, gate)] == [1, 2, 3]
+    assert [stage.optional for stage in (video, adapt, gate)] == [True, False, True]
+    assert EgoWMTrainConfig().video.steps == EgoWMTrainConfig().gate.steps == 0
     waits, learns = (tree.flatten(stage.labels(first)) for stage in (video, adapt))
     for path, label in learns.items():
         part = path.split("/")[0]
@@ -123,7 +124,7 @@ def test_its_sums_are_those_of_the_compiled_step(svd):
 def test_every_leaf_has_its_place_on_many_devices():
     config = Config(model=SVD, train=EgoWMTrainConfig(adapt=STAGE))
     mesh = jax.sharding.AbstractMesh((1, 8, 1, 1), ("data", "fsdp", "tensor", "context"))
-    _, stage = worlds.stages(SVD)
+    stage = worlds.stages(SVD)[1]
     shapes = jax.eval_shape(functools.partial(state.create, config, stage), jax.random.key(0))
     placed = tree.flatten(sharding.of_state(SVD, mesh, shapes))
     for path, leaf in tree.flatten(shapes).items():

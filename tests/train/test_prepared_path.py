@@ -214,10 +214,15 @@ def test_how_actions_enter_the_network_does_not_change_prepared_clips(tmp_path):
         )
 
     assert len({folder(), folder(inject="attention"), folder(inject="channels")}) == 1
-    assert folder(body="") == folder()
+    undrawn = folder(drawn=False)
+    assert folder(drawn=False, body="") == undrawn
     plain = base.with_model(control=presets.load("egowm").model.control)
-    others = [folder(state=0), folder(base.with_model(observed="first")), folder(plain)]
-    assert len({folder(), *others}) == 1 + len(others)
+    others = [
+        folder(state=0, drawn=False),
+        folder(base.with_model(observed="first")),
+        folder(plain),
+    ]
+    assert len({folder(), undrawn, *others}) == 2 + len(others)
 
 
 def test_a_training_learns_the_same_with_clips_in_memory_and_on_disk(
