@@ -54,8 +54,9 @@ MECHANISMS: dict[str, dict[str, Any]] = {
     "observation_logit": {"observation_logit": 0.0},
     "guesses": {"shown_logit": -1.0, "guess_logit": -1.0},
     "sampled": {"sampled": "always"},
+    "sample_steps": {"voxel_noise": {"sample_steps": 1}},
 }
-"""Rows: the settings of the world that switch a mechanism off. Without revision of guesses all
+"""Rows: the settings of the world, and of its parts, that switch a mechanism off. Without revision of guesses all
 known cells persist as observed ones do. Without ``persistence_logit`` all voxels of every frame are
 sampled, since cells that are not sampled persist too."""
 KNOWN_FRAMES = 32
@@ -78,7 +79,15 @@ SEEN_SHARE = 0.5
 
 def variant(config: Config, mechanism: str) -> Config:
     """Return the configuration with a mechanism of its world switched off; see ``MECHANISMS``."""
-    return config.with_model(**MECHANISMS[mechanism])
+    model = config.model
+    return config.with_model(
+        **{
+            name: dataclasses.replace(getattr(model, name), **value)
+            if isinstance(value, dict)
+            else value
+            for name, value in MECHANISMS[mechanism].items()
+        }
+    )
 
 
 def mechanisms(config: Config) -> list[str]:

@@ -294,6 +294,7 @@ VOXEL_ROWS = {
     "observation_logit": "observation_logit 0",
     "guesses": "guesses are not revised",
     "sampled": "voxels are sampled in every frame",
+    "sample_steps": "voxels are sampled in one step",
 }
 """Labels of a voxel world's rows; other worlds have their names."""
 

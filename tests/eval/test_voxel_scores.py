@@ -246,6 +246,8 @@ def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
     assert rows["guesses"].kept_logits == (hold, hold, hold)
     assert [rows[name].sampled for name in ("persistence_logit", "sampled")] == ["always"] * 2
     assert [rows[name].sampled for name in ("empty_prior", "guesses")] == ["new"] * 2
+    steps = [rows[name].voxel_noise.sample_steps for name in ("as trained", "sample_steps")]
+    assert steps == [2, 1]
     assert voxel_scores.mechanisms(config) == list(rows)
     # A mechanism that the world does not have gets no row.
     published = dataclasses.replace(CONFIG, model=MODEL)
