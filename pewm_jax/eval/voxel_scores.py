@@ -56,9 +56,9 @@ MECHANISMS: dict[str, dict[str, Any]] = {
     "sampled": {"sampled": "always"},
     "sample_steps": {"voxel_noise": {"sample_steps": 1}},
 }
-"""Rows: the settings of the world, and of its parts, that switch a mechanism off. Without revision of guesses all
-known cells persist as observed ones do. Without ``persistence_logit`` all voxels of every frame are
-sampled, since cells that are not sampled persist too."""
+"""Rows: the settings of the world, and of its parts, that switch a mechanism off. Without revision
+of guesses all known cells persist as observed ones do. Without ``persistence_logit`` all voxels of
+every frame are sampled, since cells that are not sampled persist too."""
 KNOWN_FRAMES = 32
 """Most frames of a walk that are rendered from a known grid."""
 PRIOR_HOUSES = 256

@@ -60,10 +60,12 @@ ACTIONS_NAMES = {
     "none": "no actions",
     "copy": "the observed frame, repeated",
     "warp": "the observed frame, warped",
+    "paint": "the same without the body, and its bones painted",
     "true - shuffled": "true minus another clip's",
     "true - none": "true minus none",
     "true - copy": "true minus the observed frame",
     "true - warp": "true minus the warped frame",
+    "true - paint": "true minus the painted bones",
 }
 """Labels of the kinds of actions given to a model, and of their differences."""
 TRUTH_NAME = "the true clip"
@@ -268,7 +270,7 @@ def compare_steering(found: Mapping[str, Any]) -> list[str]:
     lines, scores = [], found.get("scores", {})
     if "lpips" in scores:
         found_by_kind = scores["lpips"]["per_frame"]
-        for kind, title in (("copy", "copying"), ("warp", "warping")):
+        for kind, title in (("copy", "copying"), ("warp", "warping"), ("paint", "painting")):
             if kind not in found_by_kind:
                 continue
             each = (found_by_kind[name]["mean"] for name in ("true", kind))

@@ -68,7 +68,7 @@ def test_true_actions_are_compared_with_those_of_another_house_with_none_and_wit
     table = found.table()
     assert table["true - shuffled"]["houses"] == 3
     assert table["true - shuffled"]["low"] > 0
-    assert len(found.lines()) == 2 + len(ACTIONS_NAMES) - 2  # without warping
+    assert len(found.lines()) == 2 + len(ACTIONS_NAMES) - 4  # without warping and painting
     assert "75.0 % of the steps go forward" in found.lines()[0]
 
 
@@ -87,7 +87,7 @@ def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, 
     assert len(said) == 1
     metrics = {"steering": found.facts(), "protocol": {"steering": about}}
     page = render("", [], [evaluation_page.steering(metrics)])
-    assert page.count("<tr") == 1 + len(ACTIONS_NAMES) - 2
+    assert page.count("<tr") == 1 + len(ACTIONS_NAMES) - 4
     assert f"{found.psnr['true'].mean():.2f} [" in page
     assert "75 % of their steps go forward" in page
     (sentence,) = format_steering(metrics)

@@ -130,7 +130,7 @@ def test_arms_and_objects_are_scored_by_kind_of_actions(told):
     assert arms["true"]["mean"] > 0.8
     assert arms["shuffled"]["mean"] < 0.5 * arms["true"]["mean"]
     assert "none" not in arms  # the warped frame would follow the actions
-    assert arms["warp"]["mean"] < arms["true"]["mean"]
+    assert arms["warp"]["mean"] < arms["paint"]["mean"] < arms["true"]["mean"]
     assert scs["true"]["mean"] == pytest.approx(scs["truth"]["mean"])
     assert scs["true"]["mean"] > scs["shuffled"]["mean"]
     assert facts["all"]["true"]["mean"] > 60
