@@ -61,7 +61,7 @@ table2: .venv/installed
 
 test: .venv/installed-dev
 	@PYTHONDONTWRITEBYTECODE= $(PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder \
-	  -m "not slow" --hypothesis-profile quick $(ARGS)
+	  -m "not slow" --hypothesis-profile quick --durations 80 --durations-min 4 $(ARGS)
 
 # The compilers of TPUs and NVIDIA GPUs, without which a few tests are skipped; 2 GB, in an
 # environment of their own, where JAX would look for devices at every start.
