@@ -50,11 +50,14 @@ def tiny_model(**sections) -> PEWM:
 
 
 def shrink(model, frames=3, side=16):
-    """Return a world model of one tiny block, on pixels, with one sampling step."""
+    """Return a world model of one tiny block, on pixels, with one sampling step.
+
+    It has a gate if the model has one.
+    """
     return dataclasses.replace(
         model,
         clip=dataclasses.replace(model.clip, frames=frames, height=side, width=side),
-        codec=PixelConfig(temporal=1),
+        codec=PixelConfig(temporal=1, gate=8 if getattr(model.codec, "gate", 0) else 0),
         backbone=DiTBackbone(
             layers=1, heads=1, head_dim=16, text_length=1, text_dim=8, time_dim=16
         ),

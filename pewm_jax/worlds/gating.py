@@ -42,10 +42,11 @@ def prepare(
     key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
     noise = jax.random.normal(key, shape)
-    shown = readout if memory else None
-    latents = world_model.sample(
-        model, params, conditioning, shown, noise, jax.random.fold_in(key, 1)
-    )
+    shown, blind = readout if memory else None, None
+    if not memory and model.noise.guidance != 1:
+        blind = world_model.blind(model, params, conditioning, jnp.ones(shape[0], bool))
+    again = jax.random.fold_in(key, 1)
+    latents = world_model.sample(model, params, conditioning, shown, noise, again, blind=blind)
     return clip.without_context().with_extras(
         context_features_ShwF=None, latents_thwC=latents, readout=readout
     )

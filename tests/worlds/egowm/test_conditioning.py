@@ -205,6 +205,29 @@ def test_training_has_the_state_of_the_last_observed_frame(monkeypatch):
         np.testing.assert_array_equal(state, clip.actions_TA[:, 1])
 
 
+def test_clips_for_the_gate_are_imagined_with_guidance(monkeypatch):
+    warped = dataclasses.replace(
+        DIT,
+        clip=dataclasses.replace(DIT.clip, depth=True),
+        codec=PixelConfig(temporal=1, gate=4),
+        observed="warped",
+    )
+    given = []
+
+    def sample(model, _params, _conditioning, readout, noise_BthwC, _key, *, blind):
+        given.append((readout, blind))
+        return noise_BthwC
+
+    monkeypatch.setattr(world_model, "sample", sample)
+    for guidance in (1.0, 2.0):
+        model = dataclasses.replace(
+            warped, noise=dataclasses.replace(warped.noise, guidance=guidance)
+        )
+        worlds.stages(model)[2].prepare(model, random_params(model), clip_of(model))
+    assert [readout for readout, _ in given] == [None, None]
+    assert [blind is None for _, blind in given] == [True, False]
+
+
 def test_a_network_without_further_tokens_refuses_them():
     with pytest.raises(ConfigError, match="attends to no further tokens"):
         dataclasses.replace(SVD, control=ModulationConfig(inject="attention"))
