@@ -205,8 +205,9 @@ class Prepared:
         missing = count - len(self.batches)
         with Meter(f"preparing {self._stage.title}'s clips", missing, "batches") as meter:
             for _ in range(missing):
-                clip = unless_stopped(self._prepare)
-                if clip is None:
+                # Of the batches after a missing one some may be there.
+                clip = self._kept()
+                if clip is None and (clip := unless_stopped(self._prepare)) is None:
                     return False
                 self.batches.append(clip)
                 meter.advance(1)
@@ -223,9 +224,20 @@ class Prepared:
                 self.batches.append(self._prepare() if clip is None else clip)
                 self.batches.pop(0)
                 self._done = number
-                if self._folder is not None:
-                    _file(self._folder, _oldest(self._config, number) - 1).unlink(missing_ok=True)
+                self._delete_old(number)
             yield _stacked(self.batches, _rows_of_window(len(self.batches), batch, seed, number))
+
+    def _delete_old(self, number: int) -> None:
+        """Delete the files that no resumed training needs after this step.
+
+        Batches are drawn ahead of training, which resumes at its last checkpoint.
+        """
+        if self._folder is None:
+            return
+        earliest = max(number - self._config.train.save_every - AHEAD - 1, 0)
+        for file in self._folder.glob("*.safetensors"):
+            if int(file.stem) < _oldest(self._config, earliest):
+                file.unlink(missing_ok=True)
 
     def _kept(self) -> Clip | None:
         """Return the next batch from disk; None if it is not there."""

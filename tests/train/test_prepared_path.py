@@ -120,19 +120,26 @@ def test_a_folder_half_made_is_continued(tmp_path):
 
 def test_old_clips_give_way_to_new_ones_also_after_an_interruption(tmp_path):
     def draw(config, done, count):
-        clips = feed.Prepared(config, STAGE, PARAMS, Reader(config), done)
+        reader = Reader(config)
+        clips = feed.Prepared(config, STAGE, PARAMS, reader, done)
         assert clips.fill(lambda call: call())
-        return list(itertools.islice(clips.draw(8, STAGE.data_seed(config)), count))
+        drawn = list(itertools.islice(clips.draw(8, STAGE.data_seed(config)), count))
+        return drawn, reader.taken
 
     kept = experiment(tmp_path)
     for folder in ("", tmp_path):
-        config = experiment(folder)
-        data = dataclasses.replace(config.data, refresh=2)
-        config = dataclasses.replace(config, data=data)
-        whole = draw(config, 0, 7)
-        same(draw(config, 3, 4), whole[3:])
+        config = fakes.with_train(experiment(folder, refresh=2), save_every=1)
+        whole, _ = draw(config, 0, 7)
+        again, taken = draw(config, 3, 4)
+        same(again, whole[3:])
+        # Batches were drawn 4 steps ahead of the checkpoint at step 3, and all are there.
+        assert taken == ([0] if folder else [1, 2, 3, 4, 5])
     names = [file.stem for file in files(tmp_path)]
-    assert names == ["00003", "00004", "00005"]  # steps 6 and 7 of three batches each
+    assert names == ["00001", "00002", "00003", "00004", "00005"]
+    next(tmp_path.rglob("00002.safetensors")).unlink()  # one that is gone is made, no other
+    again, taken = draw(config, 3, 4)
+    same(again, whole[3:])
+    assert taken == [0, 2]
     source = fakes.clips(kept, seed=feed.prepared_seed(kept, STAGE), batch=8)
     loaded = list(itertools.islice(source, 6))
     for step, drawn in enumerate(whole):
