@@ -266,6 +266,16 @@ class Conditioner(Settings):
     body: Any = ""
     rate: Any = 1.0
 
+    @property
+    def sees_cameras(self) -> bool:
+        """Whether the poses of a clip's cameras reach the denoiser."""
+        return not self.actions
+
+    @property
+    def only_embeds(self) -> bool:
+        """Whether actions reach the denoiser through the control's parameters alone."""
+        return bool(self.actions)
+
     def channels(self, model: Any) -> int:
         """Return the channels, at the latent rate, that it adds to the denoiser's input."""
         del model

@@ -249,7 +249,9 @@ class TrainSettings:
     from, or have another shape there; these parameters start at random."""
     wider: tuple[str, ...] = ()
     """Kernels (regular expressions of their paths) that may have more input channels than in the
-    weights a stage starts from: the further ones, which are the last, start at zero."""
+    weights a stage starts from: the further ones, which are the last, start at zero. The order is:
+    noisy latents, observed frame, and of the control the rays, the actions, the drawings; so rays
+    cannot be added to weights that were trained with actions or drawings as channels."""
     image_noise_mean: float = -3.0
     """Mean of log σ of the noise added to the observed first frame."""
     image_noise_std: float = 0.5

@@ -91,6 +91,16 @@ class ModulationConfig(Conditioner):
     rate: float = 10.0  # type: ignore[assignment]
     """Factor of the learning rate of these layers, which are new in a pre-trained model."""
 
+    @property
+    def sees_cameras(self) -> bool:
+        """Whether rays are joined."""
+        return self.rays
+
+    @property
+    def only_embeds(self) -> bool:
+        """Whether neither rays nor drawings tell how the agent moves."""
+        return not (self.rays or self.drawn)
+
     def channels(self, model: Any) -> int:
         """Return the channels of rays, actions and drawings, if they are joined."""
         codec = model.codec

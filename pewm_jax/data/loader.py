@@ -331,6 +331,7 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
     ``import`` lists which have depth; of other splits the first episode decides, or ``first``.
     """
     spec, name = task.batch_spec, type(task).__name__
+    control = getattr(task, "control", None)
     listed = source.manifest.settings.get("depth", {None: True})
     state = dict(spec.extras).get("state_A")
     if not (spec.depth or spec.poses or state):
@@ -350,6 +351,13 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
             f"{source.path} has episodes with {has}, and control.state is {state.shape[0]}: "
             "collect with --body, import data that have them, or use control.state 0."
         )
+    body = (first.info.get("body") or {}).get("name", "")
+    if getattr(control, "drawn", False) and body != control.body:
+        recorder = f"the body {body}" if body else "an unknown body"
+        raise ConfigError(
+            f"{source.path} was recorded by {recorder}, and control.drawn draws the arms of "
+            f"{control.body}: use control.drawn false (--model.control.no_drawn)."
+        )
     if spec.poses and first.info.get("poses") == "unknown":
         raise ConfigError(
             f"{source.path} has episodes whose camera poses are unknown, and {name} needs them: "
@@ -358,14 +366,23 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
 
 
 def require_same_cells(world: World, episode: Episode) -> None:
-    """Raise ConfigError if an episode's voxel classes or images are not those that a world expects.
+    """Raise ConfigError if an episode's voxels or images are not those that a world expects.
 
-    Worlds without a memory of kind ``grid`` accept any. Class tables that ``collect`` did not make
+    That is the side of its cells and of its grids, the classes, and what the images show. Worlds
+    without a memory of kind ``grid`` accept any. Class tables that ``collect`` did not make
     are not compared.
     """
     memory: Any = getattr(world, "memory", None)
     if not getattr(memory, "CLASSES", False) or episode.voxel_grid is None:
         return
+    grid, cell_m = episode.voxel_grid, memory.cell_m[0]
+    if not np.isclose(grid.cell_m, cell_m, rtol=1e-6) or grid.side != memory.recorded:
+        raise ConfigError(
+            f"episode {episode.name} has grids of {grid.side} cells of {grid.cell_m:g} m along "
+            f"each axis, and this world needs {memory.recorded} of {cell_m:g} m (memory.recorded, "
+            f"memory.cell_m): collect with --voxels.side {memory.recorded} --voxels.cell "
+            f"{cell_m:g}."
+        )
     for made in itertools.product(("all", "groups"), range(1, len(PALETTE) + 1)):
         kinds, colours = made
         names = VoxelsConfig(kinds=kinds, colours=colours).names

@@ -43,7 +43,7 @@ from pewm_jax.train import processes
 
 TRAINED_ON = "train"
 """The training split."""
-REPORT_VERSION = 13
+REPORT_VERSION = 14
 """Increase it whenever the same scores would give a different report."""
 PAGE, METRICS, STRIP, MOVING = "index.html", "metrics.json", "strip.png", "strip.gif"
 PROTOCOL = "protocol.json"
@@ -204,6 +204,7 @@ def _open_job(loaded: runs.LoadedRun, changes: Mapping[str, Any]) -> _Job:
     split = Path(config.data.path) / config.evaluate.split
     episodes = EpisodeSource(split)
     require_recorded(config.model, episodes)
+    voxel_report.require_data(config, episodes)
     none = runs.open_none(loaded, config)
     data_hash = file_hash(split / MANIFEST)
     metrics = select_metrics(

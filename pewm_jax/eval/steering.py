@@ -223,7 +223,7 @@ def score(
     among = {choice.episode for choice in choices}
     try:
         walks = choose_walks(config, episodes, len(choices), config.evaluate.chain, among)
-        if walks.recorded and _warps(config):
+        if walks.recorded and _sees_cameras(config):
             for choice in walks.choices:
                 _body_of(episodes[choice.episode])
     except UserError as error:
@@ -238,7 +238,7 @@ def score(
 
     found = map_resumable(
         pieces.keys,
-        lambda key: f"steering-walks2-{measures.key}-{key[0]}-clip{key[1]:04d}",
+        lambda key: f"steering-walks2-{measures.key}-seed{pieces.seed}-{key[0]}-clip{key[1]:04d}",
         work,
         cache=cache,
         what="steering",
@@ -362,7 +362,7 @@ def with_actions(
     """Return the control of a clip with other actions; its state stays.
 
     Its cameras stay, too, if the model does not see them; a model that gets the warped observed
-    frame gets the cameras to which the actions lead.
+    frame, or rays, gets the cameras to which the actions lead.
 
     Args:
         config: the settings.
@@ -374,7 +374,7 @@ def with_actions(
     Raises:
         UserError: the cameras to which the actions lead are unknown.
     """
-    if not _warps(config):
+    if not _sees_cameras(config):
         return dataclasses.replace(own, actions_TA=actions_TA)
     body, scale = _body_of(episode)
     present = episode.world_from_camera[start]
@@ -392,9 +392,9 @@ def _body_of(episode: Episode) -> tuple[Body, float]:
     about = episode.info.get("body") or {}
     if about.get("name") not in BODIES or episode.states is None:
         raise UserError(
-            "this world renders the observed frame from the cameras to which actions lead, and "
-            "those of recorded actions are known for a known body alone: use data collected with "
-            "--body, or train with model.observed every."
+            "this world sees the cameras to which actions lead, and those of recorded actions are "
+            "known for a known body alone: use data collected with --body, or train with "
+            "model.observed every and without control.rays."
         )
     return BODIES[about["name"]], float(about["scale"])
 
@@ -412,12 +412,18 @@ def _imagined(
     return jax.vmap(one)(context, control, numbers_B)
 
 
+def _sees_cameras(config: Config) -> bool:
+    """Return whether the cameras to which actions lead reach the model."""
+    control = getattr(config.model, "control", None)
+    return _warps(config) or getattr(control, "sees_cameras", False)
+
+
 def _warps(config: Config) -> bool:
     return isinstance(config.model, AssembledModel) and config.model.observed == "warped"
 
 
 def _draws_arms(config: Config) -> bool:
-    return getattr(config.model.control, "drawn", False)
+    return getattr(getattr(config.model, "control", None), "drawn", False)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
@@ -456,9 +462,10 @@ def _warped(config: Config, context: Frames, control: Any, painted: bool) -> Arr
 def _with_zero_actions(config: Config, params: Params) -> Params | None:
     """Return weights whose control embeds every action as zero, or None if there are none.
 
-    A warped observed frame follows the actions as well.
+    A warped observed frame, rays and drawings follow the actions as well.
     """
-    silent = config.model.capabilities.silent_actions and not _warps(config)
-    if not silent or "control" not in params:
+    control = getattr(config.model, "control", None)
+    embedded = config.model.capabilities.silent_actions and getattr(control, "only_embeds", True)
+    if not embedded or _sees_cameras(config) or "control" not in params:
         return None
     return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

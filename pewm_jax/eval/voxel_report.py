@@ -28,6 +28,8 @@ from pewm_jax.types import Params
 
 UNSEEN, KNOWN, LONG, BESIDE = "unseen", "known", "long", "beside"
 """Pieces of work."""
+VERSION = 2
+"""Increase it whenever a score is measured in another way: older pieces are not reused then."""
 STRETCHES = 3
 """Parts of equal length of a long walk, over which PSNR is averaged."""
 Key = tuple[str, str]
@@ -67,8 +69,56 @@ def settings_of(config: Config) -> dict[str, Any]:
         "long_sha256": data,
         "frames": chosen.long_frames if chosen.long else 0,
         "beside": {name: open_run(name).weights_hash for name in chosen.beside},
-        "mechanisms": chosen.mechanisms == "on",
+        "rows": _rows(config),
+        "prior_sha256": file_hash(prior) if (prior := _prior_manifest(config)).is_file() else "",
     }
+
+
+def require_data(config: Config, episodes: Sequence[Episode]) -> None:
+    """Refuse data or settings that cannot be measured, before hours of imagining.
+
+    Raises:
+        UserError: the episodes have no voxels or other ones than the world, long walks are too
+            short, another world has another size of images, or there are too few windows for FVD.
+    """
+    if not config.model.capabilities.voxels:
+        return
+    chosen, first = config.evaluate, episodes[0]
+    if first.voxel_grid is None:
+        raise UserError(
+            f"the episodes of {config.data.path} have no voxels, which this world is scored by: "
+            "use data of pewm-jax data collect --voxels."
+        )
+    require_same_cells(config.model, first)
+    if not chosen.long:
+        return
+    settings_of(config)  # refuses a folder without data
+    source = EpisodeSource(Path(chosen.long) / chosen.split)
+    some = [source[k] for k in range(min(len(source), chosen.batch))]
+    require_same_cells(config.model, some[0])
+    needed = config.data.context + chosen.long_frames
+    for one in some:
+        if one.length < needed:
+            raise UserError(
+                f"episode {one.name} of {chosen.long} has {one.length} frames, and long walks need "
+                f"{needed} (data.context + evaluate.long_frames): collect longer episodes, or "
+                "lower evaluate.long_frames."
+            )
+    windows = len(some) * (chosen.long_frames // horizon.WINDOW)
+    if chosen.fvd == "on" and windows < 2:
+        raise UserError(
+            f"FVD needs two windows of {horizon.WINDOW} frames, and {len(some)} walks of "
+            f"{chosen.long_frames} frames have {windows}: raise evaluate.long_frames or "
+            "evaluate.batch, or use --fvd off."
+        )
+    size = config.model.clip.height, config.model.clip.width
+    for name in chosen.beside:
+        clip = open_run(name).config.model.clip
+        if (clip.height, clip.width) != size:
+            raise UserError(
+                f"evaluate.beside names {name}, which has images of {clip.width}×{clip.height} "
+                f"pixels, and this world has {size[1]}×{size[0]}: name worlds of the same size."
+            )
 
 
 def score(
@@ -87,7 +137,7 @@ def score(
     if not config.model.capabilities.voxels:
         return None
     settings = settings_of(config)
-    rows = voxel_scores.mechanisms(config) if settings["mechanisms"] else [AS_TRAINED]
+    rows = settings["rows"]
     long = None
     if config.evaluate.long:
         long = _read_walks(config)
@@ -114,7 +164,9 @@ def score(
 def _inputs(key: Key, settings: Mapping[str, Any]) -> list[Any]:
     """Return what a piece of work depends on, besides the protocol; other rows do not matter."""
     piece, name = key
-    inputs: list[Any] = [*key, MECHANISMS.get(name)]
+    inputs: list[Any] = [VERSION, *key, MECHANISMS.get(name)]
+    if key == (UNSEEN, AS_TRAINED):
+        inputs.append(settings["prior_sha256"])
     if piece in (LONG, BESIDE):
         inputs += [settings["long_sha256"], settings["frames"]]
     return [*inputs, settings["beside"][name]] if piece == BESIDE else inputs
@@ -168,12 +220,20 @@ def _measure(
     }
 
 
+def _rows(config: Config) -> list[str]:
+    """Return the rows of the table that are about this world."""
+    return voxel_scores.mechanisms(config) if config.evaluate.mechanisms == "on" else [AS_TRAINED]
+
+
+def _prior_manifest(config: Config) -> Path:
+    return Path(config.data.path) / "train" / MANIFEST
+
+
 def _prior(config: Config) -> list[voxel_scores.UnseenCells]:
     """Return windows of the training split, or none if it is not there."""
-    split = Path(config.data.path) / "train"
-    if not (split / MANIFEST).is_file():
+    if not _prior_manifest(config).is_file():
         return []
-    source = EpisodeSource(split)
+    source = EpisodeSource(_prior_manifest(config).parent)
     count = min(len(source), voxel_scores.PRIOR_HOUSES)
     return voxel_scores.prior_places(config, [source[k] for k in range(count)])
 

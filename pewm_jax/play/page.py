@@ -120,6 +120,7 @@ class Page:
         self.driver = Driver(load, start, self.show, folder, ahead=serve.ahead)
         self._add_driving()
         self._joints = JointsPanel(self._server, self._put)
+        self._shown: tuple[Any, int] = (None, 0)
         self._add_editing()
         self._add_starting()
         self._files = FilesPanel(self._server, self._put)
@@ -279,6 +280,15 @@ class Page:
 
         self._steps = steps
 
+    def _show_joints(self, now: session.Session | None) -> None:
+        """Set the sliders where the joints were not set by them: another drive, Load, Undo."""
+        if now is None or now.wished_A is None:
+            return
+        place, steps = self._shown
+        if now.place is not place or now.steps < steps or not now.steps:
+            self._joints.set(now.wished_A[:-2])
+        self._shown = now.place, now.steps
+
     def _show_choices(self, shown: PageUpdate) -> None:
         """Show the available sampler steps, worlds and files, and what this model can do."""
         if not hasattr(self, "_files"):  # the page is still being built
@@ -287,9 +297,7 @@ class Page:
         if shown.engine is not None:
             self._editing.visible = shown.engine.editable
             self._joints.show(shown.engine.body)
-            now = shown.session
-            if now is not None and now.wished_A is not None and not now.steps:
-                self._joints.set(now.wished_A[:-2])  # another drive, or an opened world
+            self._show_joints(shown.session)
             self._steps.visible = count != "0"
         if count not in ("0", self._steps.value):
             self._steps.options = tuple(sorted({*SAMPLER, count}, key=int))

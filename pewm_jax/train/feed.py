@@ -325,6 +325,10 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
         "seed": prepared_seed(config, stage),
         "batch": stage.settings(config).batch,
     }
+    if "backbone" in stage.prepares_by and not stage.memory:
+        # Earlier versions imagined these clips without guidance and noise.
+        guided = config.model.noise.guidance != 1 or getattr(config.model, "image_noise", 0.0)
+        facts |= {"as_in_rollouts": True} if guided else {}
     text = json.dumps(facts, sort_keys=True)
     kind = "memory" if stage.memory else "frames"
     name = f"{kind}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"

@@ -36,13 +36,7 @@ CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
 BASE = "base.json"
 
-MUTABLE_FIELDS = (
-    "evaluate",
-    "model.last_alone",
-    "data.features",
-    "data.prepared_path",
-    "data.workers",
-    "data.bad_records",
+SAMPLER = (
     "model.noise.sample_steps",
     "model.noise.sampler",
     "model.noise.spacing",
@@ -56,6 +50,16 @@ MUTABLE_FIELDS = (
     "model.noise.rho",
     "model.noise.ends",
     "model.noise.rendered_until",
+)
+"""Settings of the sampler, on which only stages that train on imagined clips depend."""
+MUTABLE_FIELDS = (
+    "evaluate",
+    "model.last_alone",
+    "data.features",
+    "data.prepared_path",
+    "data.workers",
+    "data.bad_records",
+    *SAMPLER,
     "train.run",
     "train.save_every",
     "train.keep",
@@ -69,7 +73,8 @@ MUTABLE_FIELDS = (
     "train.preview_every",
     "train.log",
 )
-"""Settings that may change when a run is resumed: none affects what is learned.
+"""Settings that may change when a run is resumed: none affects what is learned, except that those
+of ``SAMPLER`` affect stages that train on imagined clips; runs with such stages keep them.
 
 ``data.features`` is one: features are checked by their hashes when they are opened. So is
 ``data.prepared_path``: its subfolders are named by hashes of all that the clips depend on."""
@@ -134,6 +139,19 @@ def differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
     ]
 
 
+def _sampler_differences(there: Config, here: Config) -> list[str]:
+    """Return the differences of samplers, if a stage to train imagines its clips."""
+    stages = [stage for stage in all_stages(here) if stage.settings(here).steps > 0]
+    if not any("backbone" in stage.prepares_by for stage in stages):
+        return []
+    old, new = (_flatten(configuration.to_dict(config)) for config in (there, here))
+    return [
+        f"{name} {old.get(name)} there, {new.get(name)} here"
+        for name in SAMPLER
+        if old.get(name) != new.get(name)
+    ]
+
+
 def phrase(wrong: list[str]) -> str:
     """Join differences for a message; list only the first few."""
     more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
@@ -160,6 +178,7 @@ def check(config: Config) -> Path:
     if has_begun(run):
         there, here = configuration.load(path), resumed(config, lambda _: None)
         wrong = differences(identity(there), identity(here))
+        wrong += _sampler_differences(there, here)
         if wrong:
             raise ConfigError(
                 f"{run} was trained with another configuration ({phrase(wrong)}): choose another "

@@ -10,6 +10,9 @@ Stage ``sharpen`` trains the gate further on such clips, with LPIPS and a discri
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -28,7 +31,9 @@ def prepare(
 ) -> Clip:
     """Imagine a batch of clips; ``latents_thwC`` are those imagined, ``readout`` what is rendered.
 
-    The first ``history`` frames are observed. The noise depends on the clips alone.
+    The first ``history`` frames are observed. The noise depends on the clips alone. Without a
+    memory there are guidance and noise on the observed frames as in rollouts
+    (``model.image_noise``).
     """
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :history], frames)
@@ -38,8 +43,13 @@ def prepare(
         readout = MemoryReadout(view=world_model.splatted(model, observed, frames.camera))
     state = objective.state_at_start(clip, history)
     control = Control(frames.camera, clip.actions_TA, state)
-    conditioning = world_model.condition(model, params, observed, control)
     key = jax.random.fold_in(jax.random.key(0), clip.frames.rgb_THWC.astype(jnp.uint32).sum())
+    more: dict[str, Any] = {}
+    if not memory and (level := getattr(model, "image_noise", 0.0)):
+        more = {"noise_B": jnp.full(len(clean := observed.rgb_THWC), level), "clean_BTHWC": clean}
+        noisy = clean + level * jax.random.normal(jax.random.fold_in(key, 2), clean.shape)
+        observed = dataclasses.replace(observed, rgb_THWC=noisy)
+    conditioning = world_model.condition(model, params, observed, control, **more)
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
     noise = jax.random.normal(key, shape)
     shown, blind = readout if memory else None, None

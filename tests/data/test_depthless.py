@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
@@ -110,11 +111,31 @@ def test_other_worlds_refuse_and_say_why(tmp_path):
         loader.dataset(config(pewm, tmp_path / "b"), "train", 0, 1)
 
 
+def test_drawn_arms_need_the_body_that_recorded(tmp_path):
+    _, code = record(info={"body": {"name": "another", "scale": 1.0}})
+    source = EpisodeSource(split(tmp_path / "train", code))
+    world = presets.load("egowm_humanoid").model
+    states = types.SimpleNamespace(
+        states=np.zeros((2, 25)), has_depth=True, info=source[0].info, name="x"
+    )
+    with pytest.raises(
+        ConfigError, match=r"by the body another, and control\.drawn draws the arms"
+    ):
+        loader.require_recorded(world, source, states)
+    states.info = {}
+    with pytest.raises(ConfigError, match=r"by an unknown body, .*--model\.control\.no_drawn"):
+        loader.require_recorded(world, source, states)
+    states.info = {"body": {"name": "humanoid", "scale": 1.0}}
+    loader.require_recorded(world, source, states)
+
+
 def test_unknown_poses_are_refused_where_poses_are_needed(tmp_path):
     _, code = record(info={"poses": "unknown"})
     source = EpisodeSource(split(tmp_path / "train", code))
     worlds = without_depth()
     loader.require_recorded(worlds["egowm"], source)
-    for world in (worlds["nomad"], presets.load("tiny").model):
+    egowm = worlds["egowm"]
+    rays = dataclasses.replace(egowm, control=dataclasses.replace(egowm.control, rays=True))
+    for world in (worlds["nomad"], presets.load("tiny").model, rays):
         with pytest.raises(UserError, match="camera poses are unknown"):
             loader.require_recorded(world, source)

@@ -64,7 +64,7 @@ def test_where_nothing_is_met_there_is_no_depth():
 
 @pytest.mark.slow
 def test_an_episode_of_cells_shows_the_cells_it_records():
-    voxels = VoxelsConfig(record=True, cell=0.25, side=24, kinds="groups", pictures="cells")
+    voxels = VoxelsConfig(record=True, cell=0.25, side=64, kinds="groups", pictures="cells")
     plain = CollectConfig(Path("x"), frames=3, size=32)
     config = dataclasses.replace(plain, voxels=voxels, moving=True)
     episode = read_episode(make_episode(config, "train", 0))
@@ -93,6 +93,14 @@ def test_an_episode_of_cells_shows_the_cells_it_records():
     fewer = PERSIST(memory=dataclasses.replace(blocks, colours=8))
     with pytest.raises(ConfigError, match=r"--voxels\.kinds groups --voxels\.colours 16, and"):
         require_same_cells(fewer, episode)
+    larger = PERSIST(memory=dataclasses.replace(blocks, cell_m=(0.5, 0.5, 0.5)))
+    with pytest.raises(
+        ConfigError, match=r"has grids of 64 cells of 0\.25 m .* --voxels\.cell 0\.5"
+    ):
+        require_same_cells(larger, episode)
+    wider = PERSIST(memory=dataclasses.replace(blocks, recorded=72))
+    with pytest.raises(ConfigError, match=r"this world needs 72 of 0\.25 m"):
+        require_same_cells(wider, episode)
     # Worlds without a grid, or without any memory, read every dataset.
     for world in (PEWM(), NomadTask()):
         require_same_cells(world, episode)

@@ -85,6 +85,9 @@ def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, 
     again, _ = steering.score(config, PARAMS, [], choices, partials, said.append)
     np.testing.assert_array_equal(again.errors["none"], found.errors["none"])
     assert len(said) == 1
+    other = dataclasses.replace(config, evaluate=dataclasses.replace(config.evaluate, seeds=(3,)))
+    with pytest.raises(TypeError):  # another seed is imagined anew
+        steering.score(other, PARAMS, [], choices, partials, said.append)
     metrics = {"steering": found.facts(), "protocol": {"steering": about}}
     page = render("", [], [evaluation_page.steering(metrics)])
     assert page.count("<tr") == 1 + len(ACTIONS_NAMES) - 4

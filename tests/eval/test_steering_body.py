@@ -155,7 +155,7 @@ def test_without_a_known_body_it_is_unknown_where_other_actions_lead():
     choices = clips.choose(config(), plain, 3, 2)
     steered, reason = steering.score(config(), {}, plain, choices, None, print)
     assert steered is None
-    assert reason.startswith("Steering is not measured: this world renders the observed frame")
+    assert reason.startswith("Steering is not measured: this world sees the cameras")
     model = dataclasses.replace(config().model, observed="every")
     unseen = dataclasses.replace(config(), model=model)
     found = steering.with_actions(unseen, episode, choice.start, control, actions)

@@ -99,6 +99,9 @@ def test_a_step_walks_and_its_action_is_the_next_state():
     np.testing.assert_allclose(
         after.world.frame.camera.world_from_camera, pose.world_from_camera, atol=1e-5
     )
+    aside = session.apply(one, now, session.Drive((0.0, 0.2, 0.0)))
+    assert aside.said == "This body does not step aside."
+    assert aside.steps == now.steps
     far = session.apply(one, now, session.Drive((3.0, 0.0, 3.0)))
     np.testing.assert_allclose(far.state_A[-2:], HUMANOID.high[-2:], atol=1e-6)
 
@@ -175,6 +178,14 @@ def test_the_page_has_a_slider_for_every_joint_and_postures(tmp_path):
         one.driver.put(session.Begin(Start(house=2)))
         assert one.driver.wait(LONG)
         assert panel.sliders[6][1].value == round(HUMANOID.rest[6], 2)
+        after = dataclasses.replace(one.driver._session, steps=3)
+        one.show(page.PageUpdate("", engine=one.driver.engine, session=after))
+        panel.sliders[6][1].value = 0.5
+        one.show(page.PageUpdate("", engine=one.driver.engine, session=after))
+        assert panel.sliders[6][1].value == 0.5  # where the user holds it
+        earlier = dataclasses.replace(after, steps=2)
+        one.show(page.PageUpdate("", engine=one.driver.engine, session=earlier))
+        assert panel.sliders[6][1].value == round(HUMANOID.rest[6], 2)  # as after an undo
     finally:
         one.close()
 

@@ -7,7 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from pewm_jax.config import ClipConfig, ConfigError, UserError
+from pewm_jax import presets
+from pewm_jax.config import ClipConfig, ConfigError, StageConfig, UserError
 from pewm_jax.data import loader
 from pewm_jax.encoders.simple import PatchColoursConfig
 from pewm_jax.memory import feature_cache
@@ -90,6 +91,24 @@ def test_a_run_goes_on_with_features_that_were_moved(config, tmp_path):
     other = dataclasses.replace(moved, data=dataclasses.replace(moved.data, context=7))
     with pytest.raises(ConfigError, match=r"data\.context 6 there, 7 here"):
         runs.check(other)
+
+
+def test_a_run_that_learns_from_imagined_clips_keeps_its_sampler(tmp_path):
+    base = presets.load("egowm")
+    base = dataclasses.replace(
+        base, train=dataclasses.replace(base.train, run=str(tmp_path / "run"))
+    )
+    none = dataclasses.replace(base.train, gate=StageConfig(steps=0))
+    for config, keeps in ((base, True), (dataclasses.replace(base, train=none), False)):
+        (runs.prepare(config) / runs.WEIGHTS).touch()
+        noise = dataclasses.replace(config.model.noise, sample_steps=9)
+        other = config.with_model(noise=noise)
+        if keeps:
+            with pytest.raises(ConfigError, match=r"sample_steps 4 there, 9 here"):
+                runs.check(other)
+            (tmp_path / "run" / runs.WEIGHTS).unlink()
+        else:
+            runs.check(other)
 
 
 def fake_state(*_):

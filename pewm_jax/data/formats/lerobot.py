@@ -100,7 +100,7 @@ class _Cameras:
             if self.pose
             else (
                 "no feature holds the camera's pose (name one with --pose): the episodes fit "
-                "worlds that need no pose, such as egowm"
+                "worlds that need no pose, such as egowm_tiny"
             )
         )
         return RawSequence(

@@ -121,8 +121,8 @@ class EgoWM(AssembledModel):
 
     @property
     def batch_spec(self) -> BatchSpec:
-        """The clip's frames and actions; poses where no actions steer, and to warp by them."""
-        poses = not self.control.actions or self.observed == "warped"
+        """The clip's frames and actions; poses where the control needs them, and to warp by."""
+        poses = self.observed == "warped" or self.control.sees_cameras
         spec = super().batch_spec
         return dataclasses.replace(spec, context=False, features=None, poses=poses)
 
@@ -189,7 +189,7 @@ class EgoWM(AssembledModel):
     def stages(self) -> tuple[Stage, ...]:
         """Return the two stages, and a third for the gate.
 
-        ``video`` trains the backbone as a video model; the control is frozen, and has no effect at
+        ``video`` trains the backbone as a video model; the control is frozen, and embeds nothing at
         first. ``adapt`` trains backbone and control, with actions. ``gate`` trains the codec's gate
         on imagined clips; it is skipped without steps.
         """

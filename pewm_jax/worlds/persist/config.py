@@ -90,8 +90,15 @@ class PersistTrainConfig(TrainSettings):
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
 
     def require_fit(self, model: Any) -> None:
-        """Refuse classes through a decoder that cannot decode a latent alone."""
+        """Refuse classes through a decoder that cannot decode a latent alone, and single clips."""
         super().require_fit(model)
+        frames = self.world_frames
+        require(
+            not (self.elsewhere and frames.steps) or frames.batch // frames.micro_batches >= 2,
+            f"train.elsewhere is {self.elsewhere}, which takes cells of another clip of the batch, "
+            f"and train.world_frames.batch is {frames.batch} in {frames.micro_batches} parts: use "
+            "parts of at least 2 clips, or train.elsewhere 0.",
+        )
         vae = model.backbone.voxel_vae
         seen = (vae.kernel, vae.middle_kernel, len(vae.widths))
         require(

@@ -212,20 +212,31 @@ def test_clips_for_the_gate_are_imagined_with_guidance(monkeypatch):
         codec=PixelConfig(temporal=1, gate=4),
         observed="warped",
     )
-    given = []
+    given, seen = [], []
 
     def sample(model, _params, _conditioning, readout, noise_BthwC, _key, *, blind):
         given.append((readout, blind))
         return noise_BthwC
 
+    condition = world_model.condition
+
+    def observing(model, params, observed, control, **more):
+        seen.append((observed.rgb_THWC, more))
+        return condition(model, params, observed, control, **more)
+
     monkeypatch.setattr(world_model, "sample", sample)
-    for guidance in (1.0, 2.0):
-        model = dataclasses.replace(
-            warped, noise=dataclasses.replace(warped.noise, guidance=guidance)
-        )
+    monkeypatch.setattr(world_model, "condition", observing)
+    for guidance, level in ((1.0, 0.0), (2.0, 0.0), (1.0, 0.1)):
+        noise = dataclasses.replace(warped.noise, guidance=guidance)
+        model = dataclasses.replace(warped, noise=noise, image_noise=level)
         worlds.stages(model)[2].prepare(model, random_params(model), clip_of(model))
-    assert [readout for readout, _ in given] == [None, None]
-    assert [blind is None for _, blind in given] == [True, False]
+    assert [readout for readout, _ in given] == [None] * 3
+    assert [blind is None for _, blind in given] == [True, False, True]
+    (clean, nothing), _, (noisy, more) = seen
+    assert not nothing
+    np.testing.assert_allclose(more["noise_B"], 0.1)
+    np.testing.assert_array_equal(more["clean_BTHWC"], clean)
+    assert 0.05 < float(jnp.std(noisy - clean)) < 0.2
 
 
 def test_a_network_without_further_tokens_refuses_them():

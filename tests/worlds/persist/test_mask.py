@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import presets, worlds
-from pewm_jax.config import Config, ConfigError, UserError
+from pewm_jax.config import Config, ConfigError, StageConfig, UserError
 from pewm_jax.memory import class_grid
 from pewm_jax.models.persist import voxel_dit
 from pewm_jax.worlds.persist import corruption, prepare, stages, voxel_frames
@@ -375,6 +375,9 @@ def test_settings_that_do_not_fit_are_refused():
         dataclasses.replace(MASKED, guess_logit=-2.0)
     with pytest.raises(ConfigError, match=r"train\.guessed is 2"):
         Config(model=MASKED, train=PersistTrainConfig(guessed=2.0))
+    alone = StageConfig(steps=1, batch=4, micro_batches=4)
+    with pytest.raises(ConfigError, match=r"cells of another clip .* parts of at least 2 clips"):
+        Config(model=MASKED, train=PersistTrainConfig(elsewhere=0.3, world_frames=alone))
 
 
 def test_views_before_a_clip_are_turned_about_the_vertical():
