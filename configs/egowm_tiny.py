@@ -13,7 +13,7 @@ def config() -> Config:
 
     The demo's codec and form of backbone. It first becomes a video model, without actions, and then
     learns to follow them. Steps and turns are small, so that what is observed stays in view for a
-    while: the world has no memory. Its data: ``pewm-jax data collect data/ego --train 256
+    while: the world has no memory. Its data: ``pewm-jax data collect data/ego_tiny --train 256
     --validation 8 --frames 64 --step_m 0.12 --turn_deg 10 --turn_around 0 --test_policy follow
     --ids``. Test scenes are walked, since revisits with turns of 10 degrees consist of turns on the
     spot.
@@ -27,7 +27,7 @@ def config() -> Config:
             control=ModulationConfig(units=(0.25, 0.25, 1.0)),
             noise=DDPMConfig(snr_shift=4.0, max_weight=1.0, sample_steps=6),
         ),
-        data=DataConfig(path="data/ego", context=20, stride_max=1, prepared=2048),
+        data=DataConfig(path="data/ego_tiny", context=20, stride_max=1, prepared=2048),
         train=EgoWMTrainConfig(
             run="runs/egowm_tiny",
             start="codec",
