@@ -213,7 +213,8 @@ def pose(session: Session) -> np.ndarray:
 def _apply_drive(
     engine: Engine, session: Session, event: Drive, made: WorldState | None
 ) -> Session:
-    if session.place.agent is not None and event.action[1]:
+    forward, left, turn = event.action
+    if session.place.agent is not None and left and not forward and not turn:
         return dataclasses.replace(session, said="This body does not step aside.")
     action, planar, collided = wanted(session, event)
     moves = np.abs(action if session.state_A is None else action[-2:]).max() > 1e-6

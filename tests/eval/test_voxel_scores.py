@@ -321,10 +321,10 @@ def test_what_cannot_be_measured_is_refused_before_anything_is_imagined(tmp_path
     refuses("has grids of", [one(9, 3 * cell)])
     (tmp_path / "revisit").mkdir()
     (tmp_path / "revisit" / MANIFEST).write_text("{}")
-    monkeypatch.setattr(voxel_report, "EpisodeSource", lambda _: [one(40, cell)] * 2)
+    monkeypatch.setattr(voxel_report, "EpisodeSource", lambda _: [one(56, cell)] * 2)
     long = {"long": str(tmp_path), "split": "revisit", "batch": 2, "long_frames": 30}
     own = [one(9, cell)]
-    refuses("has 40 frames, and long walks need", own, **(long | {"long_frames": 40}))
+    refuses("has 56 frames, and long walks need", own, **(long | {"long_frames": 55}))
     refuses(r"FVD needs two windows", own, **(long | {"fvd": "on", "batch": 1}))
     size = SimpleNamespace(height=99, width=16)
     world = SimpleNamespace(model=SimpleNamespace(clip=size))
