@@ -112,7 +112,7 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     params, network = same_weights()
     rows = [row(params, network, batch, max(5, options.repeats)) for batch in BATCHES]
-    header = ["batch", "ours, images/s", "torch, images/s", "ours/torch (goal ≥ 1.0)"]
+    header = ["batch", "pewm_jax, images/s", "torch, images/s", "pewm_jax/torch (goal ≥ 1.0)"]
     header += ["largest difference", "compiling"]
     words = (
         "`python benchmarks/dinov2.py` beside transformers' Dinov2Model on "

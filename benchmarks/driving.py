@@ -102,12 +102,12 @@ def main() -> None:
     sentence = (
         f"{given.steps} steps with a tab open: {100 * (last / first - 1):+.1f} % of memory since "
         f"the first step. A step took {statistics.median(took):.2f} s (median; 95 of 100 below "
-        f"{np.percentile(took, 95):.2f} s), the next one asked for at once. At rest the page takes "
+        f"{np.percentile(took, 95):.2f} s), the next one requested at once. At rest the page takes "
         f"{share:.1f} % of one core."
     )
     shown = [(str(n), f"{mb:.0f}", f"{100 * (mb / first - 1):+.1f} %") for n, mb in rows]
     head = ("steps", "memory, MB", "more than after the first step")
-    parts = ["## What driving takes", machine("jax", "viser"), table(head, shown), sentence]
+    parts = ["## Time and memory of driving", machine("jax", "viser"), table(head, shown), sentence]
     text = "\n\n".join(parts)
     print(text)
     if given.record:

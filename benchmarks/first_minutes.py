@@ -106,7 +106,7 @@ def main() -> None:
         rows = [(name, f"{seconds:.1f}") for name, seconds in clock.parts]
         how = (
             "No cache of pip, none of compiled programs; the clone from the same disk. "
-            f"{waiting:.0f} other processes wanted the processor when it began."
+            f"{waiting:.0f} other processes were running at the start."
         )
         parts = ("## The first minutes", machine("jax", "viser"), how)
         record("first_minutes", "\n\n".join([*parts, table(("part", "seconds"), rows), total]))

@@ -44,8 +44,6 @@ from pewm_jax.config import Memory
 from pewm_jax.memory import voxel_map
 from pewm_jax.types import Frames
 
-GOAL = 2.0
-"""How many times faster than the fastest peer on a processor."""
 DTYPES = {"f32": jnp.float32, "bf16": jnp.bfloat16}
 
 
@@ -72,7 +70,7 @@ def planned_mb(frames: Frames, features: jax.Array) -> float:
 
 
 def comparison(repeats: int) -> tuple[str, list[str]]:
-    """Return the table of insertions and a line on the goal for each dtype."""
+    """Return the table of insertions and a line on the fastest peer for each dtype."""
     frames = room(0)
     slot_THW = slots(CONFIG, frames)
     plain = np.random.default_rng(0).normal(size=(T, PATCHES, PATCHES, CHANNELS))
@@ -82,7 +80,7 @@ def comparison(repeats: int) -> tuple[str, list[str]]:
         theirs = {"f32": torch.float32, "bf16": torch.bfloat16}[kind]
         single = plain.astype(np.float32)
         runs = {
-            "ours": inserter(CONFIG, frames, features),
+            "pewm_jax": inserter(CONFIG, frames, features),
             "torch index_reduce": torch_peer(single, theirs, slot_THW, "index_reduce"),
             "torch scatter_reduce": torch_peer(single, theirs, slot_THW, "scatter_reduce"),
             "numpy maximum.at": numpy_peer(np.asarray(features), slot_THW),
@@ -94,28 +92,25 @@ def comparison(repeats: int) -> tuple[str, list[str]]:
             for name, run in runs.items():
                 times[name].append(seconds(run) * scale.get(name, 1))
         peaks = {name: peak_mb(f"{name.split()[-1]} {kind}") for name in list(runs)[1:3]}
-        peaks["ours"] = planned_mb(frames, features)
+        peaks["pewm_jax"] = planned_mb(frames, features)
         for name, spent in times.items():
-            ratio = statistics.median(a / b for a, b in zip(spent, times["ours"], strict=True))
+            ratio = statistics.median(a / b for a, b in zip(spent, times["pewm_jax"], strict=True))
             memory = f"{peaks[name]:.0f} MB" if name in peaks else "–"
             middle = statistics.median(spent)
             rows.append([kind, name, f"{middle * 1e3:.0f} ms", f"{ratio:.1f}×", memory])
         fastest = min(
-            statistics.median(a / b for a, b in zip(spent, times["ours"], strict=True))
+            statistics.median(a / b for a, b in zip(spent, times["pewm_jax"], strict=True))
             for name, spent in times.items()
-            if name != "ours"
+            if name != "pewm_jax"
         )
-        verdict = "reached" if fastest >= GOAL else "missed"
-        lines.append(
-            f"{kind}: {fastest:.1f}× faster than the fastest peer (goal {GOAL}×: {verdict})."
-        )
-    header = ["features", "who", "one clip", "time over ours", "peak memory beyond the inputs"]
+        lines.append(f"{kind}: {fastest:.1f}× faster than the fastest peer.")
+    header = ["features", "who", "one clip", "time over pewm_jax", "peak memory beyond the inputs"]
     return table(header, rows), lines
 
 
 def check(runs: dict, slot_THW: np.ndarray, kind: str) -> None:
     """Insist that ours and torch's maps are equal up to rounding of the interpolation."""
-    voxels, theirs = runs["ours"](), runs["torch index_reduce"]().float().numpy()
+    voxels, theirs = runs["pewm_jax"](), runs["torch index_reduce"]().float().numpy()
     count = int(voxels.occupied)
     assert count == len(np.unique(slot_THW)), "as many cells"
     mine = np.asarray(voxels.features_VF[:count], np.float32)
@@ -206,7 +201,14 @@ def floor(repeats: int) -> str:
             ]
         )
     device = jax.devices()[0].device_kind
-    header = ["features", "bytes that must move", "copy bandwidth", "floor", "ours", "over floor"]
+    header = [
+        "features",
+        "bytes that must move",
+        "copy bandwidth",
+        "floor",
+        "pewm_jax",
+        "over floor",
+    ]
     return (
         f"On {device}: features and depth read once, touched cells read and written once.\n\n"
         + (table(header, rows))

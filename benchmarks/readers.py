@@ -111,7 +111,7 @@ def page(options: argparse.Namespace, found: dict[tuple[str, str, str], Result])
     rows += [["", name, "", "", "", *numbers(first[name])] for name in ("empty", "reproject")]
     protocol = first["protocol"]
     return (
-        "## How a memory is best read (readers.py)\n\n"
+        "## Readers of the memory (readers.py)\n\n"
         f"Preset {options.preset}; {options.steps1} steps of stage 1, shared; then stage 2. "
         f"{protocol['clips']} clips of {protocol['scenes']} held-out houses, "
         f"{options.seeds} sampling seed(s), one training seed; PSNR of sampled frames. The empty "

@@ -165,7 +165,7 @@ def peers(imagined: Any, truth: Any) -> dict[str, Callable[[], object]]:
         return np.asarray(ours.frames(*clips))[0]
 
     np.testing.assert_allclose(mine(), theirs(), rtol=1e-3, atol=1e-5)
-    return {"ours": mine, "torch": theirs}
+    return {"pewm_jax": mine, "torch": theirs}
 
 
 def timed(runs: dict[str, Callable[[], object]], repeats: int) -> dict[str, list[float]]:
@@ -214,10 +214,10 @@ def main() -> None:
         f"({VIDEOS} times I3D a batch: four methods and the truth), {asked:.1%}."
     )
     both = timed(peers(imagined, truth), repeats)
-    ratio = statistics.median(b / a for a, b in zip(both["ours"], both["torch"], strict=True))
+    ratio = statistics.median(b / a for a, b in zip(both["pewm_jax"], both["torch"], strict=True))
     middle = {name: statistics.median(each) for name, each in both.items()}
     second = table(
-        [f"LPIPS of {frames} pairs of frames", "ours", "torch", "torch over ours"],
+        [f"LPIPS of {frames} pairs of frames", "pewm_jax", "torch", "torch over pewm_jax"],
         [["AlexNet", *(f"{1e3 * middle[name]:.0f} ms" for name in middle), f"{ratio:.2f}×"]],
     )
     print(first, words, second, sep="\n\n", flush=True)

@@ -154,7 +154,7 @@ def main() -> None:
                 for number, (code, words) in enumerate(starts):
                     rows.append(row(name, number, started(code, *words)))
                     print("  ".join(rows[-1]), flush=True)
-    how = f"{os.getloadavg()[0]:.0f} processes wanted the processor at the end."
+    how = f"{os.getloadavg()[0]:.0f} processes were running at the end."
     title = "## The second start\n\nThe model `small`; seconds of whole processes."
     text = f"{title} {how}\n\n{machine('jax', 'jaxlib')}\n\n{table(HEADER, rows)}"
     print(text)

@@ -93,11 +93,11 @@ def measure(repeats: int) -> tuple[dict[str, list[float]], str]:
     ours = functools.partial(plain, points, colours, valid, camera, SIZE, SIZE)
     view, covered = ours(), drawn(most=3)
     runs: dict[str, Callable[[], object]] = {
-        "ours, splat": ours,
+        "pewm_jax, splat": ours,
         "torch, scatter_reduce": peer,
-        "ours, splat_surfels, 1 pixel": functools.partial(drawn, most=1),
-        "ours, splat_surfels, up to 3 × 3 pixels": functools.partial(drawn, most=3),
-        "ours, fill_nearest": functools.partial(fill, covered),
+        "pewm_jax, splat_surfels, 1 pixel": functools.partial(drawn, most=1),
+        "pewm_jax, splat_surfels, up to 3 × 3 pixels": functools.partial(drawn, most=3),
+        "pewm_jax, fill_nearest": functools.partial(fill, covered),
     }
     image, depth = (x.numpy().reshape(T, SIZE, SIZE, -1) for x in peer())
     same = np.isclose(np.asarray(view.depth_THW), depth[..., 0], atol=1e-4)
@@ -217,11 +217,11 @@ def main() -> None:
 def show(repeats: int, recorded: bool) -> None:
     """Measure, print, and rewrite the section of ``RESULTS.md`` if asked."""
     times, words = measure(repeats)
-    ours, rows = times["ours, splat"], []
+    ours, rows = times["pewm_jax, splat"], []
     for name, spent in times.items():
         ratio = statistics.median(a / b for a, b in zip(spent, ours, strict=True))
         rows.append([name, f"{statistics.median(spent) * 1e3:.0f} ms", f"{ratio:.1f}×"])
-    text = table(["what", "one clip", "time over ours, splat"], rows)
+    text = table(["what", "one clip", "time over pewm_jax, splat"], rows)
     print(text, words, sep="\n", flush=True)
     if recorded:
         how = (

@@ -1,4 +1,4 @@
-"""What training costs beside its steps: input, saving, logging, more processes, starting.
+"""Time that training spends besides its steps: input, saving, logging, more processes, starting.
 
 Run with ``python benchmarks/training.py``; ``--record`` writes the section of RESULTS.md. Every
 part runs the demo as a user would (``train.py``, the real loop, its own process) on data that are
@@ -160,7 +160,7 @@ def report_input(found: Mapping[str, Any], loop: Mapping[str, Any]) -> str:
     steps = [loop[f"stage{stage}"]["step"] for stage in (1, 2)]
     rows = []
     for name in ("1 thread", "2 threads", "torch"):
-        words = "torch DataLoader, 2 processes" if name == "torch" else f"ours, {name}"
+        words = "torch DataLoader, 2 processes" if name == "torch" else f"pewm_jax, {name}"
         seconds = statistics.median(found[name])
         clips = found["batch"] / seconds
         times = [f"{step / seconds:.1f}×" for step in steps]
@@ -168,8 +168,8 @@ def report_input(found: Mapping[str, Any], loop: Mapping[str, Any]) -> str:
     header = ("who reads", "ms per batch", "clips/s", "faster than stage 1", "than stage 2")
     waits = " and ".join(f"{ms(loop[f'stage{stage}']['data'])} ms" for stage in (1, 2))
     return (
-        "**Input alone** (goal ≥ 5× faster than a step; the demo reads with 1 thread). While it "
-        f"trains, the loop waits {waits} per step for its next batch (stage 1 and 2).\n\n"
+        "**Input alone** (goal ≥ 5× faster than a step; the demo reads with 1 thread). During "
+        f"training, the loop waits {waits} per step for its next batch (stage 1 and 2).\n\n"
         + record.table(header, rows)
     )
 
@@ -189,8 +189,8 @@ def report_loop(loop: Mapping[str, Any], config: Config) -> str:
     text = (
         "**Saving and logging** (goals: a save blocks < 5 % of the time, logging < 1 %). "
         f"Measured with a save every {SAVE_EVERY} steps and a log line every step; the demo saves "
-        f"every {every} and logs every {config.train.log_every}. What a save writes behind the "
-        "steps' back costs processor time too, where the steps need all of it: *slows by*.\n\n"
+        f"every {every} and logs every {config.train.log_every}. Background "
+        "writing also uses processor time: *slows by*.\n\n"
     )
     text += record.table(header, rows)
     starts = {"cold": "first start", "resumed": "again, in the middle of stage 2"}
@@ -202,7 +202,7 @@ def report_loop(loop: Mapping[str, Any], config: Config) -> str:
         rows.append((words, f"{one['first']:.1f}", *(f"{x:.1f}" for x in (rest, *known))))
     header = ("", "until the first step is done, s", "imports, checks", "weights made or restored")
     header += ("step compiled or found", "first batch", "first step")
-    words = "**Starting**: compiled programs are kept beside the run, and found there by a restart."
+    words = "**Starting**: compiled programs are stored beside the run, and a restart reuses them."
     return f"{text}\n\n{words}\n\n{record.table(header, rows)}"
 
 
@@ -210,7 +210,7 @@ def report_processes(found: Mapping[str, Sequence[float]]) -> str:
     """Return the table of processes."""
     rows = []
     for count, seconds in found.items():
-        name = "1, joining nobody" if count == "0" else count
+        name = "1, without `--distributed`" if count == "0" else count
         more = [f"{s / base:.2f}" for s, base in zip(seconds, found["0"], strict=True)]
         rows.append((name, ms(seconds[0]), more[0], ms(seconds[1]), more[1]))
     header = ("processes", "stage 1, ms per step", "over alone", "stage 2, ms per step")
@@ -261,7 +261,7 @@ def main(argv: Sequence[str]) -> None:
     options = arguments(argv)
     config = configs.load(options.preset)
     texts = [
-        f"## What training costs beside its steps\n\n{record.machine('jax', 'grain', 'torch')}"
+        f"## Time that training spends besides its steps\n\n{record.machine('jax', 'grain', 'torch')}"
     ]
     with tempfile.TemporaryDirectory(prefix="pewm-benchmark-") as name:
         folder = Path(name)

@@ -105,11 +105,11 @@ def main() -> None:
     low = np.zeros(3, np.float32)
     ours = jax.jit(lambda a, b, c: march(a, low, CELL_M, b, c, LAYERS))
     runs: dict[str, Callable[[], Any]] = {
-        "ours": lambda: jax.block_until_ready(ours(*given)),
+        "pewm_jax": lambda: jax.block_until_ready(ours(*given)),
         "NumPy": lambda: with_numpy(ids, origins, directions),
         "torch": lambda: with_torch(*tensors),
     }
-    hits = runs["ours"]()
+    hits = runs["pewm_jax"]()
     same, there = np.asarray(hits.ids_L), np.asarray(hits.distance_L)
     for other in ("NumPy", "torch"):
         ids_there, distances = (np.asarray(x) for x in runs[other]())
@@ -133,7 +133,7 @@ def main() -> None:
         ]
         for name, each in times.items()
     ]
-    text = table([f"{rays} rays", "shortest", "median", "rays/s", "over ours"], rows)
+    text = table([f"{rays} rays", "shortest", "median", "rays/s", "over pewm_jax"], rows)
     print(text)
     if options.record:
         how = (
