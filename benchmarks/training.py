@@ -261,7 +261,8 @@ def main(argv: Sequence[str]) -> None:
     options = arguments(argv)
     config = configs.load(options.preset)
     texts = [
-        f"## Time that training spends besides its steps\n\n{record.machine('jax', 'grain', 'torch')}"
+        "## Time that training spends besides its steps\n\n"
+        + record.machine("jax", "grain", "torch")
     ]
     with tempfile.TemporaryDirectory(prefix="pewm-benchmark-") as name:
         folder = Path(name)

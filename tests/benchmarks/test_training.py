@@ -108,7 +108,9 @@ def test_the_tables_say_what_was_measured(benchmark):
     assert "| stage 1 | 500 | 500 | 100 | 1.00% | 9.09% | 1.00 | 0.20% |" in text
     assert "| first start | 10.0 | 4.0 | 1.0 | 4.0 | 0.5 | 0.5 |" in text
     rates = {"batch": 16, "1 thread": [0.1, 0.1, 9], "2 threads": [0.05], "torch": [0.2]}
-    assert "| ours, 1 thread | 100 | 160 | 5.0× | 5.0× |" in benchmark.report_input(rates, found)
+    assert "| pewm_jax, 1 thread | 100 | 160 | 5.0× | 5.0× |" in benchmark.report_input(
+        rates, found
+    )
     shared = benchmark.report_processes({"0": [0.1, 0.2], "4": [0.15, 0.2]})
     assert "| 4 | 150 | 1.50 | 200 | 1.00 |" in shared
 
