@@ -266,7 +266,7 @@ class Page:
             house = gui.add_number("House", start.house, min=0, step=1)
             seed = gui.add_number("Seed", start.seed, min=0, step=1)
             begin = gui.add_button("New drive", icon=viser.Icon.PLAYER_PLAY)
-            steps: Any = gui.add_dropdown("Sampler steps", SAMPLER)
+            steps: Any = gui.add_dropdown("Sampling steps", SAMPLER)
 
         def anew(_: Any) -> None:
             changes: dict[str, Any] = {"house": int(house.value), "seed": int(seed.value)}
@@ -290,7 +290,7 @@ class Page:
         self._shown = now.place, now.steps
 
     def _show_choices(self, shown: PageUpdate) -> None:
-        """Show the available sampler steps, worlds and files, and what this model can do."""
+        """Show the available sampling steps, worlds and files, and what this model can do."""
         if not hasattr(self, "_files"):  # the page is still being built
             return
         count = str(shown.engine.sampler_steps) if shown.engine is not None else "0"
@@ -337,7 +337,7 @@ def status_line(shown: PageUpdate, seconds: float | None, points: int) -> str:
     said = html.escape(shown.said)
     facts = []
     if shown.engine is not None and shown.engine.sampler_steps:
-        facts.append(f"{shown.engine.sampler_steps} sampler steps")
+        facts.append(f"{shown.engine.sampler_steps} sampling steps")
     if seconds is not None:
         facts.append(f"last step {seconds:.2f} s")
     if points:
