@@ -297,8 +297,11 @@ def _over_time(
             for old, new in zip(kept, (k, v), strict=True)
         )
         kept = (k[:, here:].astype(kept[0].dtype), v[:, here:].astype(kept[1].dtype))
-    logits = jnp.einsum("btnkd,bsnkd->bnkts", q, k, preferred_element_type=jnp.float32)
-    logits = jnp.where(allowed, logits / math.sqrt(config.head_dim), -jnp.inf)
-    weights = jax.nn.softmax(logits, -1).astype(v.dtype)
-    mixed = jnp.einsum("bnkts,bsnkd->btnkd", weights, v)
+    if config.context == 1:  # a frame attends to itself alone
+        mixed = v
+    else:
+        logits = jnp.einsum("btnkd,bsnkd->bnkts", q, k, preferred_element_type=jnp.float32)
+        logits = jnp.where(allowed, logits / math.sqrt(config.head_dim), -jnp.inf)
+        weights = jax.nn.softmax(logits, -1).astype(v.dtype)
+        mixed = jnp.einsum("bnkts,bsnkd->btnkd", weights, v)
     return linear(part["to_out"], mixed.reshape(x_BTND.shape)), kept
