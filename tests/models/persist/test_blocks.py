@@ -278,3 +278,14 @@ def test_arrays_of_other_shapes_are_refused():
         voxel_renderer.apply(RENDERER, {}, latents, times, seen[..., 1:])
     with pytest.raises(UserError, match="takes actions of 0 numbers"):
         voxel_renderer.apply(RENDERER, {}, latents, times, seen, actions_BTA=actions)
+
+
+def test_with_no_earlier_frames_each_is_computed_as_if_it_were_alone():
+    alone = dataclasses.replace(DIT, blocks=dataclasses.replace(BLOCKS, context=1))
+    params, inputs = weights(voxel_dit, DIT), NETS["voxel_dit"][3]
+    together = run_dit(params, inputs, config=alone)[0]
+    for frame in range(FRAMES):
+        one = tuple(x[:, frame : frame + 1] for x in inputs)
+        np.testing.assert_allclose(
+            run_dit(params, one)[0][:, 0], together[:, frame], atol=1e-5, rtol=1e-5
+        )
