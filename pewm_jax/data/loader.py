@@ -331,7 +331,7 @@ def require_recorded(task: Task, source: EpisodeSource, first: Episode | None = 
     ``import`` lists which have depth; of other splits the first episode decides, or ``first``.
     """
     spec, name = task.batch_spec, type(task).__name__
-    control = getattr(task, "control", None)
+    control: Any = getattr(task, "control", None)
     listed = source.manifest.settings.get("depth", {None: True})
     state = dict(spec.extras).get("state_A")
     if not (spec.depth or spec.poses or state):
