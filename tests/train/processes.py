@@ -114,7 +114,7 @@ def held_port():
 def by_hand(port, processes, index):
     """Return the flags of one process: for two of them those that the documentation gives."""
     lines = (ROOT / "docs" / "distributed.md").read_text().splitlines()
-    command = "python train.py demo "
+    command = "pewm-jax train demo --data.prepared 0 "
     two = [line.removeprefix(command) for line in lines if line.startswith(command)]
     assert len(two) == 2
     flags = two[min(index, 1)] if processes == 2 else f"{two[0][:-1]}{index}"
