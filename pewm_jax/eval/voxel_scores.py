@@ -2,8 +2,8 @@
 
 * **Unseen walls**: after some observed frames, the cells of the window that none of them shows are
   compared with the recorded grid: the intersection over union of walls. The baselines are the
-  prior, which is the mean layout of other houses' windows, and the observed walls, widened by some
-  cells; the threshold and the number of cells are the best for them here.
+  prior, which is the mean layout of other houses' windows, and the observed walls, extended along
+  their lines by some cells; the threshold and the number of cells are the best for them here.
 * **A known grid**: PSNR of the renderer given the recorded voxels and cameras.
 * **Long walks**: PSNR over the walk, FVD of all its windows of 16 frames. After it the camera is
   sent back to the observed frames: all pixels there were seen before, and the PSNR lost is that
@@ -64,8 +64,10 @@ KNOWN_FRAMES = 32
 PRIOR_HOUSES = 256
 """Most windows of other houses from which the mean layout is computed."""
 THRESHOLDS = np.linspace(0.02, 0.98, 49)
-WIDEST = 3
-"""Most cells by which observed walls are widened, for a baseline."""
+EXTENSIONS = (0, 1, 2, 4, 8, 16, 32)
+"""Cells by which observed walls are extended at both ends, for a baseline."""
+LINE = 4
+"""Cells of an observed wall along x or y from which on it is extended."""
 LANE = 2
 """Cells of the width that a way through a doorway needs."""
 SILL_CELLS, BELOW_HEAD_M = 1.25, 1.35
@@ -234,20 +236,30 @@ def mean_layouts(
     return found
 
 
-def widened(cells: Sequence[UnseenCells]) -> float:
-    """Return the IoU of the observed walls, widened by the number of cells that is best here."""
-    walls, found = [one.wall_XYZ & ~one.unseen_XYZ for one in cells], []
-    for _ in range(WIDEST):
-        walls = [_widen(one) for one in walls]
-        found.append(iou(cells, walls))
-    return max(found)
+def extended(cells: Sequence[UnseenCells]) -> float:
+    """Return the IoU of the observed walls, extended by the number of cells that is best here."""
+    walls = [one.wall_XYZ & ~one.unseen_XYZ for one in cells]
+    return max(iou(cells, [extend(one, count) for one in walls]) for count in EXTENSIONS)
 
 
-def _widen(cells_XYZ: np.ndarray) -> np.ndarray:
-    """Return cells and their six neighbours."""
-    wide = np.pad(cells_XYZ, 1)
-    beside = [np.roll(wide, step, axis) for axis in range(3) for step in (-1, 1)]
-    return np.any([wide, *beside], 0)[1:-1, 1:-1, 1:-1]
+def extend(wall_XYZ: np.ndarray, count: int) -> np.ndarray:
+    """Return walls (X, Y, Z), bool, extended along their lines and over the height of all of them.
+
+    Along every line of cells in x or y that holds ``LINE`` or more of them at any height, the gaps
+    are closed, and both ends are moved by ``count`` cells.
+    """
+    heights = np.flatnonzero(wall_XYZ.any((0, 1)))
+    plan_XY = wall_XYZ.any(2)
+    found_XY = plan_XY.copy()
+    for plan, found in ((plan_XY, found_XY), (plan_XY.T, found_XY.T)):
+        for number, line in enumerate(plan):
+            at = np.flatnonzero(line)
+            if len(at) >= LINE:
+                found[number, max(at[0] - count, 0) : at[-1] + 1 + count] = True
+    walls = np.zeros_like(wall_XYZ)
+    if len(heights):
+        walls[:, :, heights[0] : heights[-1] + 1] = found_XY[..., None]
+    return walls
 
 
 def unseen_scores(
@@ -262,7 +274,7 @@ def unseen_scores(
         "houses": len({one.house for one in cells}),
         "iou": iou(cells, made),
         "prior": prior,
-        "widened": widened(cells),
+        "extended": extended(cells),
         "prior_places": len(others) or len(cells),
     }
 

@@ -331,8 +331,8 @@ def format_voxels(metrics: Mapping[str, Any]) -> list[str]:
     ratio = f" ({unseen['iou'] / unseen['prior']:.2f} times)" if unseen["prior"] else ""
     walls = (
         f"IoU of walls that no observed frame shows: {unseen['iou']:.3f}; of the mean layout of "
-        f"other houses {unseen['prior']:.3f}{ratio}; of the observed walls, widened, "
-        f"{unseen['widened']:.3f}; at {unseen['places']:.0f} places in {unseen['houses']:.0f} "
+        f"other houses {unseen['prior']:.3f}{ratio}; of the observed walls, extended, "
+        f"{unseen['extended']:.3f}; at {unseen['places']:.0f} places in {unseen['houses']:.0f} "
         "houses."
     )
     said = [walls, f"PSNR of rendering a known grid: {known['psnr']:.2f} dB."]

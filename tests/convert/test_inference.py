@@ -137,7 +137,7 @@ def test_the_card_tells_base_licence_data_and_scores(run, tmp_path):
     metrics = json.loads(json.dumps(METRICS))
     metrics["protocol"]["weights_sha256"] = file_hash(run / runs.WEIGHTS)
     metrics["voxels"] = {
-        "unseen": {"iou": 0.3, "prior": 0.12, "widened": 0.19, "places": 24, "houses": 16},
+        "unseen": {"iou": 0.3, "prior": 0.12, "extended": 0.19, "places": 24, "houses": 16},
         "known": {"psnr": 22.5},
         "long": None,
         "rows": {"as trained": {"iou": 0.3}},

@@ -67,14 +67,27 @@ def test_the_prior_is_the_mean_layout_of_other_houses_at_its_best_threshold():
     assert voxel_scores.unseen_scores(some, others)["prior"] == 12 / 14  # cut above one half
 
 
-def test_observed_walls_are_widened_as_a_baseline():
+def test_observed_walls_are_extended_as_a_baseline():
     wall = np.zeros((9, 9, 9), bool)
-    wall[:4] = True
+    wall[1:8, 4, 2:7] = True
     unseen = np.ones((9, 9, 9), bool)
-    unseen[:2] = False  # the walls behind those that are seen
-    assert voxel_scores.widened([cells("a", wall, wall, unseen)]) == 1
-    unseen[:4] = False
-    assert voxel_scores.widened([cells("a", wall, wall, unseen)]) == 0
+    unseen[3:7] = False  # the middle of the wall is seen
+    assert voxel_scores.extended([cells("a", wall, wall, unseen)]) == 3 / 4  # one cell too many
+    unseen[0] = False
+    assert voxel_scores.extended([cells("a", wall, wall, unseen)]) == 3 / 4
+    wall[8, 4, 2:7] = True
+    assert voxel_scores.extended([cells("a", wall, wall, unseen)]) == 1
+    unseen[:5] = True  # three columns are too short for a line
+    assert voxel_scores.extended([cells("a", wall, wall, unseen)]) == 0
+
+    seen = np.zeros((9, 9, 9), bool)
+    seen[2, [1, 3, 4, 6], 3] = seen[2, 4, 5] = True
+    made = voxel_scores.extend(seen, 1)
+    np.testing.assert_array_equal(np.unique(np.argwhere(made)[:, 0]), [2])
+    np.testing.assert_array_equal(np.unique(np.argwhere(made)[:, 1]), np.arange(8))
+    np.testing.assert_array_equal(np.unique(np.argwhere(made)[:, 2]), [3, 4, 5])
+    assert made.sum() == 8 * 3
+    np.testing.assert_array_equal(voxel_scores.extend(made.swapaxes(0, 1), 0), made.swapaxes(0, 1))
 
 
 def test_walls_are_classes_of_walls_in_any_colour():
@@ -257,7 +270,7 @@ def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
 
 
 FACTS = {
-    "unseen": {"iou": 0.3, "prior": 0.12, "widened": 0.19, "places": 24.0, "houses": 16.0},
+    "unseen": {"iou": 0.3, "prior": 0.12, "extended": 0.19, "places": 24.0, "houses": 16.0},
     "known": {"psnr": 22.5, "frames": 32},
     "long": {"data": "d", "walks": 2, "frames": 600, "ends": [200, 400, 600], "beside": ["small"]},
     "rows": {
@@ -279,7 +292,7 @@ def test_the_terminal_shows_each_score_and_a_row_for_each_mechanism():
     for wanted in (
         "0.300",
         "0.120 (2.50 times)",
-        "widened, 0.190",
+        "extended, 0.190",
         "22.50 dB",
         "+0.25 dB",
         "of 6 doorways seen open 5",
@@ -429,7 +442,7 @@ def test_a_row_that_is_added_leaves_the_others_as_they_are(tmp_path, monkeypatch
     def measure(config, params, episodes, long, key):
         measured.append(key)
         if key[0] == "unseen":
-            return dict.fromkeys(("iou", "prior", "widened", "places", "houses"), np.ones(()))
+            return dict.fromkeys(("iou", "prior", "extended", "places", "houses"), np.ones(()))
         video = np.zeros((1, 6, 2, 2, 3), np.uint8)
         return {
             "video": video, "seen": np.ones(2), "doorways": np.zeros(2), "psnr": np.ones(()),
