@@ -23,7 +23,7 @@ class PullSettings:
     and download what the cache lacks.
     """
 
-    name: Annotated[str, tyro.conf.Positional]
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """org/name, org/name@revision, or a folder."""
     revision: str | None = None
     """A branch, a tag or a commit; by default the newest."""
@@ -38,9 +38,9 @@ class PushSettings:
     Log in first with `hf auth login` or HF_TOKEN.
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
     """A run's folder, an import or an export for inference."""
-    name: Annotated[str, tyro.conf.Positional]
+    name: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")]
     """org/name on the hub, which is created if it is new; or a path such as ./released, for the
     same files in a new folder."""
     dtype: Literal["bfloat16", "float16"] | None = None

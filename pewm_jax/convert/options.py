@@ -30,10 +30,10 @@ class ImportCogVideoX:
     REPEATED: ClassVar[tuple[str, ...]] = ("--prompt",)
     """Flags with several values that may also be given several times."""
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """The pipeline's folder, or its name on a hub (org/name or org/name@revision): transformer/,
     vae/, scheduler/ and, if prompts are to be encoded, text_encoder/ and tokenizer/."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     dtype: Dtype | None = None
     """Store weights in this precision; by default the stored one."""
@@ -90,10 +90,10 @@ class ImportCogVideoX:
 class ImportDINOv2:
     """Import DINOv2, the encoder of the map's image features."""
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """A folder of transformers (config.json, model.safetensors), its name on a hub, or the original
     repository's state dict (.pth or .safetensors)."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     dtype: Dtype | None = None
     """Store weights in this precision; by default the stored one."""
@@ -107,9 +107,9 @@ class ImportSVD:
     train DST`), with the settings of the preset egowm_svd. Before training, actions have no effect.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """The pipeline's folder, or its name on a hub: unet/, vae/, image_encoder/ and scheduler/."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     dtype: Dtype | None = None
     """Store weights in this precision; by default the stored one."""
@@ -128,10 +128,10 @@ class ImportCosmos2:
     effect.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """The pipeline's folder, or its name on a hub: transformer/, vae/, scheduler/ and, if a prompt
     is to be encoded, text_encoder/ and tokenizer/."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     dtype: Dtype | None = None
     """Store weights in this precision; by default the stored one."""
@@ -157,10 +157,10 @@ class ImportLoRA:
     of `import cogvideox` without --rgbd --camera, the result is a copy of it with merged weights.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """The file of the adapters, or a folder with pytorch_lora_weights.safetensors or
     adapter_model.safetensors."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     base: Path
     """Folder of the weights that they adapt, made by `pewm-jax convert import`."""
@@ -174,9 +174,9 @@ class Merge:
     `train.start` accepts.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """The run's folder, or a folder made by `pewm-jax convert import lora`."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
 
 
@@ -189,9 +189,9 @@ class ExportDiffusers:
     omitted.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """An imported folder, a widened one, or a training run that started from one."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     dtype: Dtype | None = None
     """Store weights in this precision; by default the stored one."""
@@ -210,9 +210,9 @@ class ExportInference:
     steps, and the licence of the weights that the training started from.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """A run's folder, made by train.py."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     dtype: Literal["bfloat16", "float16", "int8"] = "bfloat16"
     """Precision of the weights: float16 has smaller rounding errors, bfloat16 a larger range. int8
@@ -227,9 +227,9 @@ class ExportStableHLO:
     The programs are verified in a fresh process.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """A run's folder with `weights.safetensors`, or a folder of `export inference`."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create."""
     what: Literal["rollout", "denoise"] = "rollout"
     """`rollout`: start a world and imagine clips; `denoise`: one step of the denoiser."""

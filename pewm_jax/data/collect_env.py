@@ -52,7 +52,7 @@ FIX = "; fix it."
 class CollectEnvConfig:
     """Let an agent walk through your own environment and write its frames as episodes."""
 
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder to write; gets train/, validation/ and test/."""
     env: str
     """MODULE:NAME of a function or class that returns a gymnasium.Env, or of a registered

@@ -46,7 +46,7 @@ class CollectConfig:
     With --env MODULE:NAME your own environment is used instead; see `collect --env --help`.
     """
 
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Folder to write; gets train/, validation/ and revisit/."""
     train: int = 320
     """Episodes to train on."""

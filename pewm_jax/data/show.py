@@ -40,7 +40,7 @@ PIXELS = 8
 class ShowConfig:
     """Write a contact sheet of an episode and its path from above as a PNG."""
 
-    path: Annotated[Path, tyro.conf.Positional]
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """A split folder, e.g. data/demo/train."""
     episode: int = 0
     """Number of the episode."""

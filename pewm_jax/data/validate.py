@@ -34,7 +34,7 @@ SHOWN = 20
 class ValidateConfig:
     """Check a dataset, a split or a single file: sizes, hashes, counts, units, geometry."""
 
-    path: Annotated[Path, tyro.conf.Positional]
+    path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """A dataset folder, one of its splits, or an .array_record file."""
 
 

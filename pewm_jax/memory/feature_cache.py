@@ -319,9 +319,9 @@ class CacheConfig:
     other preprocessing or other data is refused when it is read.
     """
 
-    data: Annotated[Path, tyro.conf.Positional]
+    data: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DATA")]
     """A dataset folder, all finished splits of which are encoded, or the folder of one split."""
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """The folder to fill; for a dataset, it gets a folder per split."""
     encoder: str = ""
     """Folder of DINOv2 made by `pewm-jax convert import dinov2`; if empty, patch colours,

@@ -31,11 +31,11 @@ class ExportConfig:
     show`.
     """
 
-    format: Annotated[Formats, tyro.conf.Positional]
+    format: Annotated[Formats, tyro.conf.Positional, tyro.conf.arg(metavar="FORMAT")]
     """lerobot, rlds, rerun, ply, glb or mp4."""
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """A dataset folder, or one split in it, such as data/demo/train."""
-    dst: Annotated[Path, tyro.conf.Positional]
+    dst: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DST")]
     """Folder to create; or a file such as episode.rrd, for the first chosen episode."""
     episodes: tuple[int, ...] = ()
     """Numbers of episodes, counted over all splits; by default all."""

@@ -29,9 +29,9 @@ class ImportConfig:
     plugins. An import that was interrupted is resumed by the same command.
     """
 
-    src: Annotated[Path, tyro.conf.Positional]
+    src: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SRC")]
     """The recording, or a folder of several."""
-    out: Annotated[Path, tyro.conf.Positional]
+    out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Dataset folder; the episodes are added to its split."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx fy cx cy in pixels of the recorded colour images; for formats whose files do not have
