@@ -27,14 +27,15 @@ def config() -> Config:
     frames = VoxelDiTConfig(
         latent_side=vae.latent_side,
         latent_channels=vae.latent_channels,
-        patch=2,
+        patch=1,
+        patch_z=8,  # columns
         actions=3,
         pixel_channels=nets.world_frames.pixel_channels,
         pixel_patch=1,
         map_embed=8,
         map_ids=vae.classes + model.memory.colours + 1,
         map_cells=vae.factor,
-        storey=(2, 6),  # 8 to 24 cells: from the floor to 3 m above it
+        storey=(4, 12),  # 8 to 24 cells: from the floor to 3 m above it
         # No attention to earlier frames: their cells are true in training, and guesses in a
         # rollout. What is known of them is in the map.
         blocks=BlocksConfig(layers=5, heads=4, head_dim=32, context=1, **small),

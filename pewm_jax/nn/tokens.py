@@ -25,22 +25,32 @@ from pewm_jax.nn import placement
 from pewm_jax.types import Array
 
 
-def patchify(latents_BthwC: Array, patch: int, patch_t: int = 1) -> Array:
-    """(B, t, h, w, C) → (B, t/p_t·h/p·w/p, C·p_t·p·p), channels before the patch's cells."""
+def patchify(latents_BthwC: Array, patch: int | tuple[int, int], patch_t: int = 1) -> Array:
+    """(B, t, h, w, C) → (B, t/p_t·h/p·w/p, C·p_t·p·p), channels before the patch's cells.
+
+    ``patch`` may be two numbers, of rows and of columns.
+    """
     batch, frames, height, width, channels = latents_BthwC.shape
-    t, h, w = frames // patch_t, height // patch, width // patch
-    grid = latents_BthwC.reshape(batch, t, patch_t, h, patch, w, patch, channels)
-    cells = channels * patch_t * patch * patch
+    rows, columns = (patch, patch) if isinstance(patch, int) else patch
+    t, h, w = frames // patch_t, height // rows, width // columns
+    grid = latents_BthwC.reshape(batch, t, patch_t, h, rows, w, columns, channels)
+    cells = channels * patch_t * rows * columns
     return grid.transpose(0, 1, 3, 5, 7, 2, 4, 6).reshape(batch, -1, cells)
 
 
 def unpatchify(
-    tokens_BNC: Array, frames: int, height: int, width: int, patch: int, patch_t: int = 1
+    tokens_BNC: Array,
+    frames: int,
+    height: int,
+    width: int,
+    patch: int | tuple[int, int],
+    patch_t: int = 1,
 ) -> Array:
     """Invert ``patchify`` to (B, frames, height, width, C); sizes are the latents'."""
     batch = tokens_BNC.shape[0]
-    t, h, w = frames // patch_t, height // patch, width // patch
-    grid = tokens_BNC.reshape(batch, t, h, w, -1, patch_t, patch, patch)
+    rows, columns = (patch, patch) if isinstance(patch, int) else patch
+    t, h, w = frames // patch_t, height // rows, width // columns
+    grid = tokens_BNC.reshape(batch, t, h, w, -1, patch_t, rows, columns)
     return grid.transpose(0, 1, 5, 2, 6, 3, 7, 4).reshape(batch, frames, height, width, -1)
 
 

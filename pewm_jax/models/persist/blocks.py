@@ -161,6 +161,7 @@ def run(
     context_BTMD: Array | None = None,
     known_BTN: Array | None = None,
     cache: FrameCache | None = None,
+    sides: tuple[int, ...] = (),
 ) -> tuple[Array, FrameCache | None]:
     """Run all blocks on T frames; also return the cache that includes them, if there is one.
 
@@ -171,7 +172,9 @@ def run(
         context_BTMD: the tokens that ``cross`` attends to, each frame to its own.
         known_BTN: bool, which tokens later frames may read; None for all.
         cache: the frames before; None if there are none and none are kept.
+        sides: tokens of a frame along each of its axes, for ``config.rotary``.
     """
+    place_NR = place_angles(sides, config.head_dim) if config.rotary else None
     frames = x_BTND.shape[1]
     past = 0 if cache is None else config.context - 1
     first = jnp.int32(0) if cache is None else cache.count
@@ -200,8 +203,8 @@ def run(
             if part == "time":
                 mixed, kept = _over_time(config, inside, normed, angles_TR, allowed, kept)
             else:
-                context = normed if part == "space" else context_BTMD
-                mixed = _in_frame(config, inside, normed, context)
+                context, angles = (normed, place_NR) if part == "space" else (context_BTMD, None)
+                mixed = _in_frame(config, inside, normed, context, angles)
             x = x + gate * mixed
             shift, scale, gate = after
             hidden = linear(inside["up"], norm(x) * (1 + scale) + shift)
@@ -259,7 +262,33 @@ def positions(sides: tuple[int, ...], width: int) -> np.ndarray:
     return np.pad(waves, ((0, 0), (0, width - waves.shape[1]))).astype(np.float32)
 
 
-def _in_frame(config: BlocksConfig, part: Params, x_BTND: Array, context_BTMD: Array) -> Array:
+SHORTEST = 2 * math.pi
+"""Shortest wavelength of the rotation by position, tokens."""
+LONGEST = 200 * math.pi
+"""Longest wavelength, not reached, tokens."""
+
+
+def place_angles(sides: tuple[int, ...], head_dim: int) -> np.ndarray:
+    """Return (N, head_dim/2) rotary angles of a grid's positions, the pairs divided among its axes.
+
+    Axes of one token get none; pairs that are left over are not rotated.
+    """
+    axes = [axis for axis, side in enumerate(sides) if side > 1]
+    each = head_dim // 2 // max(len(axes), 1)
+    wavelength = SHORTEST * (LONGEST / SHORTEST) ** (np.arange(each) / max(each, 1))
+    places = np.stack(np.meshgrid(*map(np.arange, sides), indexing="ij"), -1)
+    places = places.reshape(math.prod(sides), len(sides), 1)[:, axes]
+    angles = (places * (2 * np.pi / wavelength)).reshape(len(places), -1)
+    return np.pad(angles, ((0, 0), (0, head_dim // 2 - angles.shape[1]))).astype(np.float32)
+
+
+def _in_frame(
+    config: BlocksConfig,
+    part: Params,
+    x_BTND: Array,
+    context_BTMD: Array,
+    angles_NR: np.ndarray | None = None,
+) -> Array:
     """Attend inside of each frame."""
     batch, frames = x_BTND.shape[:2]
 
@@ -271,6 +300,8 @@ def _in_frame(config: BlocksConfig, part: Params, x_BTND: Array, context_BTMD: A
         rms_norm(part[f"norm_{n}"], heads(f"to_{n}", x))
         for n, x in (("q", x_BTND), ("k", context_BTMD))
     )
+    if angles_NR is not None:
+        q, k = (layers.rotate_halves(x, jnp.asarray(angles_NR)) for x in (q, k))
     mixed = blocked_attention.attention(q, k, heads("to_v", context_BTMD), config.attention)
     return linear(part["to_out"], layers.merge_heads(mixed).reshape(x_BTND.shape))
 

@@ -100,6 +100,8 @@ def apply(
     x = frame_blocks.mlp(params["voxels"], seen)
     x = x + frame_blocks.mlp(params["camera"], camera_BTN.astype(dtype))
     condition = frame_blocks.mlp(params["action"], actions_BTA.astype(dtype))
-    x, cache = frame_blocks.run(config.blocks, PARTS, params, x[:, :, None], condition, cache=cache)
+    x, cache = frame_blocks.run(
+        config.blocks, PARTS, params, x[:, :, None], condition, cache=cache, sides=(1,)
+    )
     out = frame_blocks.project(params, x, condition)[:, :, 0].astype(jnp.float32)
     return out * jnp.asarray(config.units), cache

@@ -69,7 +69,7 @@ class PersistNetsConfig(Backbone):
 
     @property
     def token_cells(self) -> int:
-        """Cells along an axis of the grid for one token of a world frame."""
+        """Cells along x or y for one token of a world frame; windows move by whole tokens."""
         return self.voxel_vae.factor * self.world_frames.patch
 
     def check(self, model: Any) -> None:

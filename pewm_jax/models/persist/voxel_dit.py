@@ -18,6 +18,7 @@ layers), modulate_out, proj_out``; ``map_ids``, ``map_mask`` and ``map_fold`` wi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -43,7 +44,8 @@ STATES = 3
 
 def ends(config: VoxelDiTConfig) -> Iterator[Leaf]:
     """Yield path and shape of the parameters around the blocks."""
-    width, cells = config.blocks.width, config.latent_channels * config.patch**3
+    width, latents = config.blocks.width, math.prod(config.patches)
+    cells = config.latent_channels * latents
     yield from linear_leaves("patch_embed", cells, width)
     yield from linear_leaves("pixel_embed", config.pixel_channels * config.pixel_patch**2, width)
     yield "no_pixels/bias", (width,)
@@ -52,7 +54,7 @@ def ends(config: VoxelDiTConfig) -> Iterator[Leaf]:
     if config.camera_numbers:
         yield from frame_blocks.mlp_shapes("camera", config.camera_numbers, width)
     if config.map_embed:
-        folded = (config.patch * config.map_cells) ** 3 * config.map_embed
+        folded = latents * config.map_cells**3 * config.map_embed
         yield "map_ids/kernel", (config.map_ids, config.map_embed)
         yield "map_mask/kernel", (STATES, config.map_embed)
         yield from linear_leaves("map_fold", folded, width)
@@ -113,7 +115,7 @@ def apply(
     _require_map(config, latents_BTxyzC, map_BTXYZ)
     (batch, frames), dtype = latents_BTxyzC.shape[:2], latents_BTxyzC.dtype
     width = config.blocks.width
-    patches = patchify(_storey(config, latents_BTxyzC), config.patch, config.patch)
+    patches = _fold(config, _storey(config, latents_BTxyzC))
     x = linear(params["patch_embed"], patches.reshape(batch, frames, config.tokens, -1))
     x = x + jnp.asarray(frame_blocks.positions(config.token_sides, width), dtype)
     if map_BTXYZ is not None:
@@ -135,7 +137,7 @@ def apply(
             seen = jnp.where(jnp.asarray(shown_BT)[..., None], seen, 0)
         condition = condition + seen
     if known_BTxyz is not None:
-        patches = patchify(_storey(config, known_BTxyz[..., None]), config.patch, config.patch)
+        patches = _fold(config, _storey(config, known_BTxyz[..., None]))
         known_BTxyz = patches.all(-1).reshape(x.shape[:3])
     x, cache = frame_blocks.run(
         config.blocks,
@@ -146,11 +148,12 @@ def apply(
         context_BTMD=given,
         known_BTN=known_BTxyz,
         cache=cache,
+        sides=config.token_sides,
     )
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
-    x_side, y_side, z_side = (count * config.patch for count in config.token_sides)
-    out = unpatchify(out, x_side, y_side, z_side, config.patch, config.patch)
-    low, high = (at * config.patch for at in config.levels)
+    (low, high), (along_x, *across) = config.levels, config.patches
+    sides = config.latent_side, config.latent_side, high - low
+    out = unpatchify(out, *sides, tuple(across), along_x)
     out = out.reshape(batch, frames, *out.shape[1:])
     beside = [(0, 0)] * 4 + [(low, config.latent_side - high), (0, 0)]
     return jnp.pad(out, beside), cache
@@ -158,9 +161,15 @@ def apply(
 
 def _storey(config: VoxelDiTConfig, grid_BTxyzC: Array, cells: int = 1) -> Array:
     """Return the predicted levels of grids of ``cells`` cells per latent, (B · T, x, y, z, C)."""
-    low, high = (at * config.patch * cells for at in config.levels)
+    low, high = (at * cells for at in config.levels)
     cut = grid_BTxyzC[..., low:high, :]
     return cut.reshape(-1, *cut.shape[2:])
+
+
+def _fold(config: VoxelDiTConfig, grid_NxyzC: Array, cells: int = 1) -> Array:
+    """Return the tokens of grids of ``cells`` cells per latent, (N, tokens, channels)."""
+    along_x, along_y, along_z = (count * cells for count in config.patches)
+    return patchify(grid_NxyzC, (along_y, along_z), along_x)
 
 
 def _embed_map(
@@ -173,8 +182,7 @@ def _embed_map(
     table = params["map_ids"]["kernel"].astype(dtype)
     seen = jnp.where((ids >= 0)[..., None], table[jnp.maximum(ids, 0)], 0)
     seen = seen + params["map_mask"]["kernel"].astype(dtype)[mask]
-    side = config.patch * cells
-    folded = patchify(seen, side, side)
+    folded = _fold(config, seen, cells)
     return linear(params["map_fold"], folded.reshape(*ids_BTXYZ.shape[:2], config.tokens, -1))
 
 

@@ -193,6 +193,8 @@ def apply(
     condition = frame_blocks.embed_times(params, times_BT, dtype)
     if actions_BTA is not None:
         condition = condition + frame_blocks.mlp(params["action"], actions_BTA.astype(dtype))
-    x, cache = frame_blocks.run(config.blocks, PARTS, params, x, condition, cache=cache)
+    x, cache = frame_blocks.run(
+        config.blocks, PARTS, params, x, condition, cache=cache, sides=sides
+    )
     out = frame_blocks.project(params, x, condition).reshape(batch, frames * config.tokens, -1)
     return unpatchify(out, frames, *place, config.patch), cache

@@ -52,6 +52,10 @@ class PersistTrainConfig(TrainSettings):
     """The transformer that predicts the camera."""
     renderer: StageConfig = StageConfig()
     """The transformer that renders voxels."""
+    frames_per_clip: int = 0
+    """Frames of each clip, drawn at random, that stage `world_frames` predicts; 0 for all. Where
+    frames do not attend to earlier ones (`world_frames.blocks.context` 1), fewer frames of more
+    clips are more diverse at the same cost."""
     blind: float = 0.3
     """Share of frames after the first that are not conditioned on an image."""
 
@@ -87,6 +91,10 @@ class PersistTrainConfig(TrainSettings):
         for name in ("guessed", "elsewhere", "entering"):
             value = getattr(self, name)
             require(0 <= value <= 1, f"train.{name} is {value}: use a share, 0 to 1.")
+        require(
+            self.frames_per_clip >= 0,
+            f"train.frames_per_clip is {self.frames_per_clip}: use 0 for all, or 1 or more.",
+        )
         require(0 <= self.blind < 1, f"train.blind is {self.blind}: use 0 up to, not with, 1.")
 
     def require_fit(self, model: Any) -> None:
@@ -98,6 +106,13 @@ class PersistTrainConfig(TrainSettings):
             f"train.elsewhere is {self.elsewhere}, which takes cells of another clip of the batch, "
             f"and train.world_frames.batch is {frames.batch} in {frames.micro_batches} parts: use "
             "parts of at least 2 clips, or train.elsewhere 0.",
+        )
+        context = model.backbone.world_frames.blocks.context
+        require(
+            not self.frames_per_clip or context == 1,
+            f"train.frames_per_clip is {self.frames_per_clip} and world_frames.blocks.context "
+            f"{context}: frames that attend to earlier ones need all of these; use 0, or context "
+            "1.",
         )
         vae = model.backbone.voxel_vae
         seen = (vae.kernel, vae.middle_kernel, len(vae.widths))

@@ -121,13 +121,12 @@ def frames(model: PersistModel, params: Params, clip: Clip) -> Clip:
     latents = placement.by_batch(encode, params["voxel_vae"], flat)
     latents = latents.reshape(*shape, *latents.shape[1:])
     recorded_too = jax.vmap(jax.vmap(functools.partial(grid_state.known_latents, model)))(classes)
-    token, wide = model.backbone.token_cells, model.side
-    at = last[..., None] + jnp.arange(0, wide, token)  # (B, T, 3, tokens)
+    wide = model.side
+    at = last[..., None] + jnp.arange(0, wide, config.factor)  # (B, T, 3, latents)
     inside = (at >= start[..., None]) & (at < start[..., None] + wide)
     x, y, z = jnp.moveaxis(inside, 2, 0)
     own = x[..., :, None, None] & y[..., None, :, None] & z[..., None, None, :]
-    patch = model.backbone.world_frames.patch
-    known = grid_state.repeat_tokens(own, patch) & recorded_too
+    known = own & recorded_too
 
     corner = jnp.asarray(clip.extras["origin_T3"]) - recorded * model.cell
     middle = grid_state.middle(model, corner, last)

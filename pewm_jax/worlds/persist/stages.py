@@ -96,42 +96,49 @@ def world_frames(
     noise at any time; later frames do not read them, and their error does not count. With
     ``world_frames.map_embed`` a frame is also conditioned on a map of the cells observed up to it,
     with or without guesses of the others (``drawn_map``); the error of latents with cells that the
-    map does not hold, or guesses wrongly, weighs ``train.new`` times as much.
+    map does not hold, or guesses wrongly, weighs ``train.new`` times as much. With
+    ``train.frames_per_clip`` only so many frames of each clip, drawn at random, are predicted.
     """
     assert isinstance(train, PersistTrainConfig)
     made = _prepared(prepare.frames, model, params, clip)
-    config, known = model.backbone.world_frames, made["known"]
-    latents, pixels = made["latents"].astype(jnp.float32), made["told"].astype(jnp.float32)
-    weight = 1 + (train.occupied - 1) * made["occupied"]
+    config = model.backbone.world_frames
     velocity_key, shown_key = jax.random.split(key)
+    at_BT = _drawn_frames(train, made["known"].shape[:2], jax.random.fold_in(key, 1))
+
+    def drawn(x: Array) -> Array:
+        return x if at_BT is None else jax.vmap(lambda x, at: x[at])(x, at_BT)
+
+    known = drawn(made["known"])
+    latents = drawn(made["latents"]).astype(jnp.float32)
+    pixels = drawn(previous_frames(made["told"])).astype(jnp.float32)
+    weight = 1 + (train.occupied - 1) * drawn(made["occupied"])
     read, given = known, None
     if config.map_embed:
         map_key, velocity_key = jax.random.split(velocity_key)
-        given = drawn_map(model, train, made, map_key)
+        given = drawn_map(model, train, made, map_key, at_BT)
         ids, states = given
-        wrong = (states == voxel_dit.GUESS) & (ids != made["classes"])
+        wrong = (states == voxel_dit.GUESS) & (ids != drawn(made["classes"]))
         new = prepare.any_in_latent(model, wrong | (states == voxel_dit.ABSENT))
         weight = weight * jnp.where(new, train.new, 1.0)
         read = known & grid_state.any_in_token(model, states == voxel_dit.SEEN)
-    low, high = (at * config.patch for at in config.levels)
-    level = jnp.arange(config.latent_side)
-    known = known & (level >= low) & (level < high)
-    shown = jax.random.uniform(shown_key, latents.shape[:2]) >= train.blind
+    shown = jax.random.uniform(shown_key, made["known"].shape[:2]) >= train.blind
+    shown = shown | (jnp.arange(shown.shape[1]) == 0)
     predict = functools.partial(
         voxel_dit.apply,
         config,
         params["voxel_dit"],
-        actions_BTA=made["actions"],
-        pixels_BThwC=previous_frames(pixels),
-        camera_BTN=previous_frames(made["camera"]) if config.camera_numbers else None,
-        shown_BT=shown | (jnp.arange(latents.shape[1]) == 0) if train.blind else None,
+        actions_BTA=drawn(made["actions"]),
+        pixels_BThwC=pixels,
+        camera_BTN=drawn(previous_frames(made["camera"])) if config.camera_numbers else None,
+        shown_BT=drawn(shown) if train.blind else None,
         known_BTxyz=read,
         map_BTXYZ=given,
     )
 
     def compare(x0: Array, weight: Array, key: Array) -> tuple[Array, Array]:
         vae, frozen = model.backbone.voxel_vae, params["voxel_vae"]
-        error, right = class_error(vae, frozen, x0, made["classes"], weight, train.compared, key)
+        classes = drawn(made["classes"])
+        error, right = class_error(vae, frozen, x0, classes, weight, train.compared, key)
         return train.classes * error, right
 
     return _velocity(
@@ -146,10 +153,26 @@ def world_frames(
     )
 
 
+def _drawn_frames(train: PersistTrainConfig, shape: tuple[int, ...], key: Array) -> Array | None:
+    """Return the numbers of the frames (B, T) that a step trains on; None for all."""
+    batch, frames = shape
+    count = min(train.frames_per_clip or frames, frames)
+    if count == frames:
+        return None
+    keys = jax.random.split(key, batch)
+    return jax.vmap(lambda key: jnp.sort(jax.random.permutation(key, frames)[:count]))(keys)
+
+
 def drawn_map(
-    model: PersistModel, train: PersistTrainConfig, made: dict[str, Array], key: Array
+    model: PersistModel,
+    train: PersistTrainConfig,
+    made: dict[str, Array],
+    key: Array,
+    at_BT: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Return ids and states (B, T, X, Y, Z) of the maps that condition the frames of clips.
+    """Return ids and states (B, T, X, Y, Z) of the maps that condition frames of clips.
+
+    ``at_BT`` are the numbers of the frames in their clips; None for all of them.
 
     The frames up to a drawn one are real: what they show is observed, and so are the cells of some
     of the views before the clip. In some clips the other cells are guesses: the true cells with
@@ -159,11 +182,17 @@ def drawn_map(
     classes, frames = made["classes"].astype(jnp.int32), made["classes"].shape[1]
 
     def one(
-        classes: Array, other: Array, seen: Array, before: Array, known: Array, key: Array
+        classes: Array,
+        other: Array,
+        seen: Array,
+        before: Array,
+        known: Array,
+        at: Array,
+        key: Array,
     ) -> tuple[Array, Array]:
         keys = jax.random.split(key, 6)
         last = jax.random.randint(keys[0], (), 0, frames)
-        number = jnp.minimum(jnp.arange(frames), last)
+        number, known = jnp.minimum(at, last), known[at]
         share = jax.random.uniform(keys[1])
         views = jax.random.bernoulli(keys[2], share, (prepare.VIEWS,))
         bits = (views * (1 << jnp.arange(prepare.VIEWS))).sum().astype(jnp.uint8)
@@ -194,7 +223,9 @@ def drawn_map(
         known = jnp.repeat(known, token, axis)
     keys = jax.random.split(key, len(classes))
     others = jnp.roll(classes[:, 0], 1, 0)
-    return jax.vmap(one)(classes, others, made["seen"], made["before"], known, keys)
+    if at_BT is None:
+        at_BT = jnp.broadcast_to(jnp.arange(frames), classes.shape[:2])
+    return jax.vmap(one)(classes, others, made["seen"], made["before"], known, at_BT, keys)
 
 
 def _side(model: PersistModel, key: Array) -> Array:

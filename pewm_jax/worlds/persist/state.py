@@ -83,44 +83,47 @@ def cut_box(classes_XYZ: Array, start_3: Array, count: int | tuple[int, ...]) ->
 
 
 def known_latents(model: PersistModel, classes_XYZ: Array) -> Array:
-    """Return (x, y, z) bool: the latents of tokens whose cells are all known."""
-    token, wide = model.backbone.token_cells, model.side
-    patch, count = model.backbone.world_frames.patch, wide // token
-    known = (classes_XYZ != UNKNOWN).reshape(count, token, count, token, count, token)
-    return repeat_tokens(known.all((1, 3, 5)), patch)
+    """Return (x, y, z) bool: the latents of predicted tokens whose cells are all known."""
+    return ~any_in_token(model, classes_XYZ == UNKNOWN) & predicted_latents(model)
 
 
 def any_in_token(model: PersistModel, cells_XYZ: Array) -> Array:
-    """Return (..., x, y, z) bool: the latents of tokens that have such a cell."""
-    token, wide = model.backbone.token_cells, model.side
-    patch, count = model.backbone.world_frames.patch, wide // token
-    front = cells_XYZ.shape[:-3]
-    there = cells_XYZ.reshape(*front, count, token, count, token, count, token)
-    return repeat_tokens(there.any((-5, -3, -1)), patch)
+    """Return (..., x, y, z) bool: the latents of predicted tokens that have such a cell."""
+    config, factor = model.backbone.world_frames, model.backbone.voxel_vae.factor
+    low, high = config.levels
+    cut = cells_XYZ[..., low * factor : high * factor]
+    split = [
+        n
+        for count, p in zip(config.token_sides, config.patches, strict=True)
+        for n in (count, p * factor)
+    ]
+    there = cut.reshape(*cells_XYZ.shape[:-3], *split).any((-5, -3, -1))
+    for axis, patch in zip((-3, -2, -1), config.patches, strict=True):
+        there = jnp.repeat(there, patch, axis)
+    beside = [(0, 0)] * (there.ndim - 1) + [(low, config.latent_side - high)]
+    return jnp.pad(there, beside)
+
+
+def predicted_latents(model: PersistModel) -> np.ndarray:
+    """Return (z,) bool: the levels of a window's latents that the world frames predict."""
+    low, high = model.backbone.world_frames.levels
+    level = np.arange(model.backbone.world_frames.latent_side)
+    return (level >= low) & (level < high)
 
 
 def predicted_levels(model: PersistModel) -> np.ndarray:
     """Return (Z,) bool: the levels of a window's cells that the world frames predict."""
-    low, high = (at * model.backbone.token_cells for at in model.backbone.world_frames.levels)
-    level = np.arange(model.side)
-    return (level >= low) & (level < high)
-
-
-def repeat_tokens(known_xyz: Array, patch: int) -> Array:
-    """Repeat the values of tokens for all their latents."""
-    for axis in (-3, -2, -1):
-        known_xyz = jnp.repeat(known_xyz, patch, axis)
-    return known_xyz
+    return np.repeat(predicted_latents(model), model.backbone.voxel_vae.factor)
 
 
 def move_cache(
     model: PersistModel, cache: FrameCache, before_3: Array, after_3: Array
 ) -> FrameCache:
     """Return the cache of voxel frames for a window that has moved; new cells have no entries."""
-    tokens = (after_3 - before_3) // model.backbone.token_cells
+    moved = (after_3 - before_3) // model.backbone.token_cells
     count_3 = np.array(model.backbone.world_frames.token_sides)
     places = np.stack(np.meshgrid(*map(np.arange, count_3), indexing="ij"), -1).reshape(-1, 3)
-    source = places + tokens
+    source = places + moved.at[2].set(0)
     inside = ((source >= 0) & (source < count_3)).all(-1)
     at = jnp.clip(source, 0, count_3 - 1)
     row = (at[:, 0] * count_3[1] + at[:, 1]) * count_3[2] + at[:, 2]

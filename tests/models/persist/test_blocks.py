@@ -18,6 +18,7 @@ from pewm_jax.models.persist.config import (
     VoxelDiTConfig,
     VoxelRendererConfig,
 )
+from pewm_jax.nn import layers
 from tests.models.persist.networks import normal, weights
 
 BLOCKS = BlocksConfig(layers=2, heads=2, head_dim=8, mlp_ratio=2, context=3)
@@ -51,6 +52,24 @@ def run_camera(params, inputs, cache=None, config=CAMERA):
 
 def run_renderer(params, inputs, cache=None, config=RENDERER):
     return voxel_renderer.apply(config, params, *inputs, cache=cache)
+
+
+@pytest.mark.parametrize("sides", [(5,), (3, 4), (3, 2, 4), (4, 4, 1)])
+def test_rotated_attention_depends_on_distances_along_each_axis(sides):
+    angles = frame_blocks.place_angles(sides, 12)
+    assert angles.shape == (np.prod(sides), 6)
+    q, k = normal(0, 12), normal(1, 12)
+    rotated = [layers.rotate_halves(jnp.broadcast_to(x, (len(angles), 12)), angles) for x in (q, k)]
+    logits = np.asarray(rotated[0] @ rotated[1].T)
+    places = np.argwhere(np.ones(sides))
+    distance = places[:, None] - places
+    by_distance = {}
+    for at, value in zip(distance.reshape(-1, len(sides)), logits.reshape(-1), strict=True):
+        by_distance.setdefault(tuple(at), []).append(value)
+    for values in by_distance.values():
+        np.testing.assert_allclose(values, values[0], atol=1e-4)
+    firsts = np.sort([values[0] for values in by_distance.values()])
+    assert np.diff(firsts).min() > 1e-6  # every distance has its own logit
 
 
 NETS = {

@@ -357,11 +357,63 @@ def test_the_error_of_new_cells_weighs_more(made):
     np.testing.assert_allclose(ten, alone * 10 * share / (1 + 9 * share), rtol=1e-3)
 
 
+def test_drawn_frames_of_clips_are_predicted_and_no_others(made):
+    nets = MASKED.backbone
+    frames = dataclasses.replace(
+        nets.world_frames, blocks=dataclasses.replace(nets.world_frames.blocks, context=1)
+    )
+    model = dataclasses.replace(MASKED, backbone=dataclasses.replace(nets, world_frames=frames))
+    latents = normal(0, 2, 3, 4, 4, 4, 3).at[:, 2].set(jnp.nan)
+    batch = made | {
+        "latents": latents, "told": normal(1, 2, 3, 4, 4, 88), "camera": normal(2, 2, 3, 10),
+        "actions": normal(3, 2, 3, 3), "occupied": np.zeros((2, 3, 4, 4, 4), bool),
+    }  # fmt: skip
+    clip = dataclasses.replace(recorded(2), extras={"prepared": batch})
+    params = {"voxel_dit": weights(voxel_dit, frames)}
+    keys = jax.random.split(KEY, 8)
+
+    def errors(count):
+        train = dataclasses.replace(TRAIN, frames_per_clip=count)
+        one = jax.jit(lambda key: stages.world_frames(model, train, params, clip, key)[0])
+        return np.array([one(key) for key in keys])
+
+    assert np.isnan(errors(0)).all()
+    assert np.isnan(errors(3)).all()
+    assert 0 < np.isnan(errors(1)).mean() < 1  # the frame without a number is not always drawn
+    two = dataclasses.replace(TRAIN, frames_per_clip=2)
+    drawn = np.array([stages._drawn_frames(two, (4, 5), key) for key in keys])
+    assert drawn.shape == (8, 4, 2)
+    assert (np.diff(drawn) > 0).all()
+    assert set(np.unique(drawn)) == set(range(5))
+
+
+@pytest.mark.parametrize("storey", [(0, 0), (1, 3)])
+def test_a_column_is_known_if_all_its_predicted_cells_are(storey):
+    frames = dataclasses.replace(
+        MASKED.backbone.world_frames, storey=storey, patch_z=2 if storey == (1, 3) else 4
+    )
+    nets = dataclasses.replace(MASKED.backbone, world_frames=frames)
+    model = dataclasses.replace(MASKED, backbone=nets)
+    cells = np.zeros((8, 8, 8), np.int16)
+    cells[2, 5, 4] = -1  # latent (1, 2, 2)
+    cells[7, 7, 7] = -1  # latent (3, 3, 3)
+    low, high = frames.levels
+    wanted = np.zeros((4, 4, 4), bool)
+    wanted[..., low:high] = True
+    wanted[1, 2] = False
+    wanted[3, 3] &= high == 3  # the cell is above the storey
+    np.testing.assert_array_equal(windows.known_latents(model, cells), wanted)
+    there = np.zeros((4, 4, 4), bool)
+    there[..., low:high] = ~wanted[..., low:high]
+    np.testing.assert_array_equal(windows.any_in_token(model, cells < 0), there)
+
+
 def test_settings_that_do_not_fit_are_refused():
     nets = MASKED.backbone
     for part, change, says in (
         ("world_frames", {"map_ids": 13}, "map_ids and map_cells are (13, 2)"),
         ("world_frames", {"storey": (2, 9)}, "voxel_dit.storey is (2, 9)"),
+        ("world_frames", {"patch_z": 2}, "voxel_dit.patch_z is 2"),
         ("renderer", {"corrupted": 0.8}, "together at most 1"),
     ):
         with pytest.raises(ConfigError, match=re.escape(says)):
@@ -375,6 +427,10 @@ def test_settings_that_do_not_fit_are_refused():
         dataclasses.replace(MASKED, guess_logit=-2.0)
     with pytest.raises(ConfigError, match=r"train\.guessed is 2"):
         Config(model=MASKED, train=PersistTrainConfig(guessed=2.0))
+    with pytest.raises(ConfigError, match=r"frames_per_clip is 1 and .*context 3"):
+        Config(model=MASKED, train=PersistTrainConfig(frames_per_clip=1))
+    with pytest.raises(ConfigError, match=r"train\.frames_per_clip is -1"):
+        Config(model=MASKED, train=PersistTrainConfig(frames_per_clip=-1))
     alone = StageConfig(steps=1, batch=4, micro_batches=4)
     with pytest.raises(ConfigError, match=r"cells of another clip .* parts of at least 2 clips"):
         Config(model=MASKED, train=PersistTrainConfig(elsewhere=0.3, world_frames=alone))

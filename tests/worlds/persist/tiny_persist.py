@@ -54,9 +54,15 @@ MODEL = PERSIST(
 
 def _masked() -> PERSIST:
     nets = MODEL.backbone
-    blocks = dataclasses.replace(BLOCKS, modulation="shared", gates="open")
+    blocks = dataclasses.replace(BLOCKS, modulation="shared", gates="open", rotary=True)
     frames = dataclasses.replace(
-        nets.world_frames, map_embed=2, map_ids=15, map_cells=2, storey=(0, 3), blocks=blocks
+        nets.world_frames,
+        patch_z=3,
+        map_embed=2,
+        map_ids=15,
+        map_cells=2,
+        storey=(0, 3),
+        blocks=blocks,
     )
     view = dataclasses.replace(nets.renderer, corrupted=0.4, imagined=0.4)
     return dataclasses.replace(
@@ -69,4 +75,4 @@ def _masked() -> PERSIST:
 
 
 MASKED = _masked()
-"""With a mask of observed cells as an input, and guesses that can be revised."""
+"""With a mask of observed cells as an input, columns as tokens, and guesses that can be revised."""
