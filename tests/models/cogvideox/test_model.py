@@ -53,6 +53,11 @@ def test_unpatchify_inverts_patchify(t, h, w, p, p_t, c):
     tokens = patchify(latents, p, p_t)
     assert tokens.shape == (2, t * h * w, c * p_t * p * p)
     np.testing.assert_array_equal(unpatchify(tokens, t * p_t, h * p, w * p, p, p_t), latents)
+    np.testing.assert_array_equal(patchify(latents, (p, p), p_t), tokens)
+    whole = (h * p, 1)
+    tokens = patchify(latents, whole, p_t)
+    assert tokens.shape == (2, t * w * p, c * p_t * h * p)
+    np.testing.assert_array_equal(unpatchify(tokens, t * p_t, h * p, w * p, whole, p_t), latents)
 
 
 def test_a_fresh_network_predicts_zero():
