@@ -1,6 +1,6 @@
 """PERSIST for hours of two CPU cores: houses of blocks at 64×64 pixels, with observed cells.
 
-Other than in ``persist_tiny`` the world frames have tokens of 1 m, a mask of observed cells, eight
+Other than in ``persist_tiny`` the world frames have columns as tokens, a mask of observed cells, eight
 sampling steps and a map whose guesses can be revised. Batches are small: many steps learn faster.
 """
 
@@ -38,7 +38,7 @@ def config() -> Config:
         storey=(4, 12),  # 8 to 24 cells: from the floor to 3 m above it
         # No attention to earlier frames: their cells are true in training, and guesses in a
         # rollout. What is known of them is in the map.
-        blocks=BlocksConfig(layers=5, heads=4, head_dim=32, context=1, **small),
+        blocks=BlocksConfig(layers=5, heads=4, head_dim=32, context=1, rotary=True, **small),
     )
     renderer = dataclasses.replace(
         nets.renderer,
@@ -78,9 +78,9 @@ def config() -> Config:
             base.data,
             path="data/persist_houses",
             stride_max=2,
-            prepared=1440,
+            prepared=2880,
             prepared_path="data/persist_prepared",
-            refresh=6,
+            refresh=8,
         ),
         train=dataclasses.replace(
             base.train,
@@ -89,9 +89,10 @@ def config() -> Config:
                 steps=2000, batch=3, learning_rate=4e-3, warmup=50, optimizer="adam"
             ),
             voxel_statistics=StageConfig(steps=60, batch=8, learning_rate=0.05, warmup=0),
-            world_frames=StageConfig(steps=4800, batch=4, learning_rate=1.5e-3, warmup=50),
+            world_frames=StageConfig(steps=8000, batch=8, learning_rate=1.5e-3, warmup=50),
             camera=StageConfig(steps=200, batch=16, learning_rate=1e-3, warmup=20),
             renderer=StageConfig(steps=8000, batch=4, learning_rate=1.5e-3, warmup=50),
+            frames_per_clip=2,
             new=10.0,
             elsewhere=0.3,
             occupied=3.0,
