@@ -1,7 +1,8 @@
 """PERSIST for hours of two CPU cores: houses of blocks at 64×64 pixels, with observed cells.
 
-Other than in ``persist_tiny`` the world frames have columns as tokens, a mask of observed cells, eight
-sampling steps and a map whose guesses can be revised. Batches are small: many steps learn faster.
+Other than in ``persist_tiny`` the world frames have columns as tokens, a mask of observed cells,
+eight sampling steps and a map whose guesses can be revised. Batches are small: many steps learn
+faster.
 """
 
 import dataclasses
