@@ -249,7 +249,7 @@ def extend(wall_XYZ: np.ndarray, count: int) -> np.ndarray:
     are closed, and both ends are moved by ``count`` cells.
     """
     heights = np.flatnonzero(wall_XYZ.any((0, 1)))
-    plan_XY = wall_XYZ.any(2)
+    plan_XY = np.asarray(wall_XYZ.any(2))
     found_XY = plan_XY.copy()
     for plan, found in ((plan_XY, found_XY), (plan_XY.T, found_XY.T)):
         for number, line in enumerate(plan):

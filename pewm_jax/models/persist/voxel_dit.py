@@ -151,9 +151,9 @@ def apply(
         sides=config.token_sides,
     )
     out = frame_blocks.project(params, x, condition).reshape(batch * frames, config.tokens, -1)
-    (low, high), (along_x, *across) = config.levels, config.patches
+    (low, high), (along_x, along_y, along_z) = config.levels, config.patches
     sides = config.latent_side, config.latent_side, high - low
-    out = unpatchify(out, *sides, tuple(across), along_x)
+    out = unpatchify(out, *sides, (along_y, along_z), along_x)
     out = out.reshape(batch, frames, *out.shape[1:])
     beside = [(0, 0)] * 4 + [(low, config.latent_side - high), (0, 0)]
     return jnp.pad(out, beside), cache
