@@ -66,6 +66,7 @@ def settings_of(config: Config) -> dict[str, Any]:
             )
         data = file_hash(manifest)
     return {
+        "version": VERSION,
         "long_sha256": data,
         "frames": chosen.long_frames if chosen.long else 0,
         "beside": {name: open_run(name).weights_hash for name in chosen.beside},

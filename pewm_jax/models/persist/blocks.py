@@ -174,7 +174,7 @@ def run(
         cache: the frames before; None if there are none and none are kept.
         sides: tokens of a frame along each of its axes, for ``config.rotary``.
     """
-    place_NR = place_angles(sides, config.head_dim) if config.rotary else None
+    position_NR = position_angles(sides, config.head_dim) if config.rotary else None
     frames = x_BTND.shape[1]
     past = 0 if cache is None else config.context - 1
     first = jnp.int32(0) if cache is None else cache.count
@@ -203,7 +203,7 @@ def run(
             if part == "time":
                 mixed, kept = _over_time(config, inside, normed, angles_TR, allowed, kept)
             else:
-                context, angles = (normed, place_NR) if part == "space" else (context_BTMD, None)
+                context, angles = (normed, position_NR) if part == "space" else (context_BTMD, None)
                 mixed = _in_frame(config, inside, normed, context, angles)
             x = x + gate * mixed
             shift, scale, gate = after
@@ -268,10 +268,11 @@ LONGEST = 200 * math.pi
 """Longest wavelength, not reached, tokens."""
 
 
-def place_angles(sides: tuple[int, ...], head_dim: int) -> np.ndarray:
-    """Return (N, head_dim/2) rotary angles of a grid's positions, the pairs divided among its axes.
+def position_angles(sides: tuple[int, ...], head_dim: int) -> np.ndarray:
+    """Return (N, head_dim/2) rotary angles (arXiv 2104.09864) of a grid's positions.
 
-    Axes of one token get none; pairs that are left over are not rotated.
+    The channel pairs are divided among the axes with more than one token; those that are left over
+    are not rotated.
     """
     axes = [axis for axis, side in enumerate(sides) if side > 1]
     each = head_dim // 2 // max(len(axes), 1)

@@ -34,9 +34,8 @@ class BlocksConfig:
     blocks share that linear layer and add a learned vector each (adaLN-single, arXiv 2310.00426),
     which takes less than a third of the parameters of a block."""
     rotary: bool = False
-    """Whether attention inside of a frame also rotates queries and keys by the token's position, so
-    that it depends on distances along each axis; not as published. Small networks learn lines and
-    neighbours faster with it than from added sinusoids alone."""
+    """Rotary position embedding (arXiv 2104.09864) in the attention inside of a frame, so that it
+    depends on distances along each axis, besides the added sinusoids; not as published."""
     attention: Literal["auto", "xla", "cudnn", "splash"] = "auto"
     """The kernel of attention inside of a frame and to pixels: `cudnn` is flash attention on NVIDIA
     GPUs in 16 bits, `splash` is flash attention on TPUs, `xla` runs anywhere, `auto` uses the best

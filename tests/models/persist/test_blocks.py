@@ -56,7 +56,7 @@ def run_renderer(params, inputs, cache=None, config=RENDERER):
 
 @pytest.mark.parametrize("sides", [(5,), (3, 4), (3, 2, 4), (4, 4, 1)])
 def test_rotated_attention_depends_on_distances_along_each_axis(sides):
-    angles = frame_blocks.place_angles(sides, 12)
+    angles = frame_blocks.position_angles(sides, 12)
     assert angles.shape == (np.prod(sides), 6)
     q, k = normal(0, 12), normal(1, 12)
     rotated = [layers.rotate_halves(jnp.broadcast_to(x, (len(angles), 12)), angles) for x in (q, k)]
