@@ -141,6 +141,7 @@ def test_a_world_imagines_and_learns_with_it_and_reads_its_memory_at_every_cell(
     assert float(jnp.abs(gradients["backbone"]["into"]["kernel"]).max()) > 0
 
 
+@pytest.mark.slow
 def test_a_fresh_reader_changes_nothing_and_hidden_memories_are_not_read():
     clip, key = clips(), jax.random.key(1)
     readout = objective.clip_readout(MODEL, random_world(MODEL), clip)
@@ -214,6 +215,7 @@ def test_drawn_frames_are_the_observed_one_and_others_in_order():
     assert found == set(range(9))
 
 
+@pytest.mark.slow
 def test_a_step_of_drawn_frames_has_the_loss_of_these_frames_prepared_or_not():
     params, clip, key = random_world(MODEL), clips(), jax.random.key(4)
     prepared = objective.prepare(MODEL, params, clip, memory=True)

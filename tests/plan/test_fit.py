@@ -137,6 +137,7 @@ def test_what_does_not_fit_corrects_the_estimates_until_something_fits(monkeypat
     assert len(set(compiler.asked)) == len(compiler.asked), "nothing is compiled twice"
 
 
+@pytest.mark.slow
 def test_if_nothing_fits_the_smallest_is_named(monkeypatch, stage):
     Compiler(monkeypatch, capacity=1e6)
     found = fit.search(experiment(), stage, CHIP, 2, 3, lambda _: None)
@@ -146,6 +147,7 @@ def test_if_nothing_fits_the_smallest_is_named(monkeypatch, stage):
     assert any("none fits; the smallest" in line for line in fit.lines(found))
 
 
+@pytest.mark.slow
 def test_a_combination_on_which_the_compiler_fails_is_left_out(monkeypatch, stage):
     config = experiment()
     first = MeshSizes(data=2)

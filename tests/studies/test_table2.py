@@ -231,6 +231,7 @@ def test_any_number_of_candidates_is_reprojected_by_one_program():
     assert deciders._reproject._cache_size() == known
 
 
+@pytest.mark.slow(only="memory")
 @pytest.mark.parametrize("mind", ["truth", "reproject", "memory"])
 def test_a_closed_loop_observes_what_is_really_seen_after_each_clip(mind):
     config = presets.load("tiny")  # 4 actions at once
@@ -270,6 +271,7 @@ def without_memory():
     return config, world_model.init(config.model, jax.random.key(1), memory=False)
 
 
+@pytest.mark.slow
 def test_a_model_trained_without_memory_decides_by_its_own_weights():
     config = presets.load("tiny")
     none, goal, actions = without_memory(), task(0, actions=4), np.array([[1, 0, 1, 2]])

@@ -63,6 +63,7 @@ def test_it_is_that_of_one_frame_and_counts_less_in_noise():
     assert all(float(measured(first, 1e-3, jax.random.key(s))) < 1e-5 for s in range(8))
 
 
+@pytest.mark.slow
 def test_it_is_added_with_its_weight_in_the_stages_that_have_it():
     params = init_world(MODEL) | {"lpips": NETWORK}
     clip, key = clips(), jax.random.key(2)

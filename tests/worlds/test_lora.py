@@ -155,7 +155,7 @@ def test_only_what_an_asked_stage_trains_is_adapted():
     assert {path.split("/")[1] for path in alone.stored} == {"memory"}
 
 
-@pytest.mark.slow(but="int8")
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["int8", "fp8"])
 def test_quantized_weights_imagine_nearly_the_same(precision):
     config = experiments()["cogvideox"]

@@ -315,6 +315,7 @@ def test_the_gate_of_egowm_shows_the_observed_frame_chunk_after_chunk():
     assert np.abs(taken.rgb_THWC - ungated.rgb_THWC).max() > 0.1
 
 
+@pytest.mark.slow
 def test_the_gate_of_egowm_learns_on_imagined_clips_and_the_rest_is_frozen():
     config = Config(model=GATED, train=EgoWMTrainConfig())
     stage = worlds.stages(config)[2]

@@ -169,6 +169,7 @@ def test_every_form_of_a_convolution_agrees(frames):
         np.testing.assert_allclose(other, volume, atol=1e-4)
 
 
+@pytest.mark.slow(but="1")
 @pytest.mark.parametrize("frames", [1, 17])
 def test_frames_are_normalised_and_convolved_one_after_the_other(params, frames):
     forms = [dataclasses.replace(TINY, convolution=form) for form in ("volume", "frames")]

@@ -205,6 +205,7 @@ def test_training_has_the_state_of_the_last_observed_frame(monkeypatch):
         np.testing.assert_array_equal(state, clip.actions_TA[:, 1])
 
 
+@pytest.mark.slow
 def test_clips_for_the_gate_are_imagined_with_guidance(monkeypatch):
     warped = dataclasses.replace(
         DIT,

@@ -332,6 +332,7 @@ def test_a_map_in_training_holds_what_was_observed_and_guesses_or_nothing(made):
     assert ((share > 0.1) & (share < 0.6)).all()
 
 
+@pytest.mark.slow
 def test_the_error_of_new_cells_weighs_more(made):
     """With a silent network the loss is the weighted mean of the squared target."""
     frames = dataclasses.replace(MASKED.backbone.world_frames)
