@@ -13,17 +13,17 @@ from pewm_jax.worlds.pewm.world import PEWM
 def config() -> Config:
     """Return the settings of ``small2``.
 
-    Its data: ``pewm-jax data collect data/small2 --train 4000 --frames 72 --handheld 0.3``. The
-    observed frame is rendered from each camera, and 30 % of the rendered memories have errors,
-    as those of real recordings have. Surfels are finer than those of ``small``, for surfaces nearer
-    than those of generated houses. Batches are small and of few frames: many steps learn faster.
-    ``docs/trials.md`` has its scores: with so few steps it is behind ``small`` where a memory
-    exists. A step takes 0.4 to 0.9 s on two CPU cores. The gate is trained on clips that the model
-    imagines, with LPIPS in its loss (``pip install 'pewm-jax[metrics]'``).
+    Its data: ``pewm-jax data collect data/small2 --train 3000 --frames 72 --handheld 0.3``.
+    Training starts from the weights of ``egowm``, which already denoise frames that begin with the
+    observed one; the reader of the memory is new. The observed frame is rendered from each camera,
+    and 30 % of the rendered memories have errors, as those of real recordings have. Surfels are
+    finer than those of ``small``, for surfaces nearer than those of generated houses. Batches are
+    small and of few frames: many steps learn faster. LPIPS is part of the losses (``pip install
+    'pewm-jax[metrics]'``), and the gate is trained last, on clips that the model imagines.
     """
     base = demo.config().model
     reader = RenderConfig(picture_width=192, blocks=False)
-    of_frames = StageConfig(batch=4, frames=3, learning_rate=3e-3)
+    of_frames = StageConfig(batch=4, frames=3, learning_rate=2e-3)
     return Config(
         model=PEWM(
             clip=base.clip,
@@ -43,18 +43,23 @@ def config() -> Config:
             path="data/small2",
             context=20,
             stride_max=2,
-            prepared=3072,
+            prepared=2048,
             prepared_path="data/small2_prepared",
-            refresh=3,
+            refresh=2,
         ),
         train=TrainConfig(
             run="runs/small2",
             optimizer="muon",
-            stage1=dataclasses.replace(of_frames, steps=800, warmup=100),
-            stage2=dataclasses.replace(of_frames, steps=200, warmup=50),
-            joint=dataclasses.replace(of_frames, steps=4600, whole=0.15, warmup=100),
-            gate=StageConfig(steps=400, batch=4, learning_rate=1e-3, warmup=50),
+            start="egowm",
+            fresh=(r"memory/.*", r"control/.*"),
+            wider=("backbone/into/kernel",),
+            stage1=dataclasses.replace(of_frames, steps=0),
+            stage2=dataclasses.replace(of_frames, steps=0),
+            joint=dataclasses.replace(of_frames, steps=16000, whole=0.15, warmup=100),
+            gate=StageConfig(steps=1200, batch=4, learning_rate=1e-3, warmup=50),
             gate_lpips=2.0,
+            denoised_lpips=0.3,
+            denoised_lpips_weights="equal",
             hidden=0.15,
             chained=0.15,
             memory_errors=0.3,

@@ -246,7 +246,8 @@ class TrainSettings:
     """Train low-rank adapters in place of the weights."""
     fresh: tuple[str, ...] = (r"memory/.*",)
     """Parameter paths (regular expressions) that may be missing from the weights a stage starts
-    from, or have another shape there; these parameters start at random."""
+    from, or have another shape there; these parameters start at random. Weights of such paths that
+    the model does not have are left out."""
     wider: tuple[str, ...] = ()
     """Kernels (regular expressions of their paths) that may have more input channels than in the
     weights a stage starts from: the further ones, which are the last, start at zero. The order is:

@@ -88,9 +88,10 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Par
 
     Leaves that match ``train.fresh`` may be missing and are initialized randomly: the memory blocks
     of stage 2, which the weights of stage 1 do not contain. Those of another shape are left out,
-    such as the control of other actions. Kernels that match ``train.wider`` may have fewer inputs:
-    the further ones are zero. Leaves that serve training alone may be missing, too; no weights
-    contain them. ``start`` and ``like``, all parameters of the stage, may be their shapes.
+    such as the control of other actions, and those that the model does not have. Kernels that match
+    ``train.wider`` may have fewer inputs: the further ones are zero. Leaves that serve training
+    alone may be missing, too; no weights contain them. ``start`` and ``like``, all parameters of
+    the stage, may be their shapes.
 
     Raises:
         TreeError: another leaf is missing, a leaf is unexpected or has another shape; lists them.
@@ -101,9 +102,8 @@ def require_start(config: Config, stage: Stage, start: Any, like: Params) -> Par
         if path in parameters and lora.matches(config.train.wider, path)
         else leaf
         for path, leaf in tree.flatten(start).items()
-        if path not in parameters
-        or np.shape(leaf) == np.shape(parameters[path])
-        or not lora.matches(config.train.fresh, path)
+        if not lora.matches(config.train.fresh, path)
+        or (path in parameters and np.shape(leaf) == np.shape(parameters[path]))
     }
     lacking = (*config.train.fresh, *stage.training_only)
     wanted = {

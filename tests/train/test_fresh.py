@@ -70,6 +70,15 @@ def test_of_another_shape_may_be_what_may_be_absent(whole):
         create(other, fresh=())
 
 
+def test_what_the_model_has_not_is_left_out_if_it_may_be_absent(whole):
+    more = whole | {"control": {"kernel": np.ones((2, 3), np.float32)}}
+    made = create(more, fresh=(r"control/.*",))
+    assert "control" not in made.params
+    assert same(made.params, whole) == tree.flatten(whole).keys()
+    with pytest.raises(tree.TreeError, match="control/kernel is unexpected"):
+        create(more)
+
+
 def test_kernels_may_get_further_inputs_which_begin_at_zero(whole):
     kernel = whole["backbone"]["kernel"]
     fewer = {**whole, "backbone": {**whole["backbone"], "kernel": kernel[:-1]}}
