@@ -27,6 +27,8 @@ class FlowConfig(Noise):
 
     shift: float = 1.0
     """Time shift s: t → s t / (1 + (s − 1) t); above 1 spends more steps near pure noise."""
+    sample_shift: float = 0.0
+    """Time shift of the sampler, if it is another than that of training; 0: `shift`."""
     times: Literal["uniform", "logit_normal"] = "uniform"
     """Distribution of times in training."""
     per_frame: bool = False
@@ -43,6 +45,7 @@ class FlowConfig(Noise):
         """Validate."""
         require_positive(self, "noise", "sample_steps")
         require_fields(self, "noise", lambda value: value > 0, "a number above 0", "shift", "scale")
+        require_fields(self, "noise", lambda value: value >= 0, "0 or more", "sample_shift")
 
     @property
     def velocity_in_unit_time(self) -> bool:
@@ -80,8 +83,8 @@ class FlowConfig(Noise):
 
     def levels(self) -> np.ndarray:
         """Return (sample_steps,) times from 1 downwards, shifted."""
-        time = np.linspace(1, 0, self.sample_steps + 1)[:-1]
-        return np.asarray(self.shift * time / (1 + (self.shift - 1) * time))
+        even = np.linspace(1, 0, self.sample_steps + 1)[:-1]
+        return np.asarray(self._shifted(even, sampler=True))
 
     def sample(self, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
         """Follow the flow from t = 1 to 0 by Euler's method."""
@@ -98,9 +101,10 @@ class FlowConfig(Noise):
         out, _ = jax.lax.scan(step, noise, (jnp.asarray(times), jnp.asarray(after)))
         return out
 
-    def _shifted(self, time: Array) -> Array:
+    def _shifted(self, time: Any, sampler: bool = False) -> Any:
         """Return s t / (1 + (s − 1) t)."""
-        return self.shift * time / (1 + (self.shift - 1) * time)
+        shift = self.sample_shift or self.shift if sampler else self.shift
+        return shift * time / (1 + (shift - 1) * time)
 
 
 @dataclasses.dataclass(frozen=True)

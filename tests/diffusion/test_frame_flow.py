@@ -79,6 +79,9 @@ def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
     even = np.linspace(1, 0, 21)[:-1]
     np.testing.assert_allclose(config.levels(), 3 * even / (1 + 2 * even), rtol=1e-6)
     assert FrameFlowConfig.levels is FlowConfig.levels
+    other = dataclasses.replace(config, sample_shift=0.5, shifted_times=True)
+    np.testing.assert_allclose(other.levels(), 0.5 * even / (1 - 0.5 * even), rtol=1e-6)
+    np.testing.assert_array_equal(other.draw(jax.random.key(0), 400, 5), shifted)
 
 
 def test_given_frames_have_a_little_noise_and_say_so():
@@ -89,7 +92,9 @@ def test_given_frames_have_a_little_noise_and_say_so():
     np.testing.assert_allclose(np.asarray(x_t).std(), 0.1, rtol=0.05)
 
 
-@pytest.mark.parametrize("wrong", [{"smallest": 1.0}, {"context_noise": -0.1}, {"shift": 0.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"smallest": 1.0}, {"context_noise": -0.1}, {"shift": 0.0}, {"sample_shift": -1.0}]
+)
 def test_settings_that_cannot_work_are_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         FrameFlowConfig(**wrong)
