@@ -40,6 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("run", help="folder of a finished training, or shipped weights")
     parser.add_argument("--out", type=Path, required=True, help="folder of the files")
+    parser.add_argument("--name", default="clip", help="beginning of the files' names")
     parser.add_argument("--data", help="data folder; by default the run's")
     parser.add_argument("--split", help="folder inside it; by default the run's evaluate.split")
     parser.add_argument("--clips", type=int, default=4, help="the first clips, by index")
@@ -70,9 +71,9 @@ def main() -> None:
         times = picture_steps(len(truth.rgb_THWC))
         strip = [(name, [rgb[t] for t in times]) for name, rgb in rows.items()]
         captions = [f"frame {t}" if t else "observed" for t in times]
-        save_png(given.out / f"clip{number:02d}.png", grid(strip, captions, title=title))
+        save_png(given.out / f"{given.name}{number:02d}.png", grid(strip, captions, title=title))
         film = encode_h264(small_frames(list(rows.items()), cell=192))
-        atomic.write_bytes(given.out / f"clip{number:02d}.mp4", film)
+        atomic.write_bytes(given.out / f"{given.name}{number:02d}.mp4", film)
         print(title)
 
 

@@ -36,7 +36,7 @@ def config() -> Config:
         map_embed=8,
         map_ids=vae.classes + model.memory.colours + 1,
         map_cells=vae.factor,
-        storey=(4, 12),  # 8 to 24 cells: from the floor to 3 m above it
+        storey=(4, 12),  # 8 to 24 cells: 4 m that contain floor and ceiling
         # No attention to earlier frames: their cells are true in training, and guesses in a
         # rollout. What is known of them is in the map.
         blocks=BlocksConfig(layers=5, heads=4, head_dim=32, context=1, rotary=True, **small),

@@ -1,8 +1,9 @@
 """Measure whether actions steer a world: imagine clips with true, shuffled and no actions.
 
 A world that follows its actions is closest to the ground truth with the true ones. *Shuffled*
-actions are those of a clip in another house. *None* are zero embeddings, as observed frames have:
-available only for models whose control can be zeroed and whose observed frame is not warped.
+actions are those of a clip in another house. *None* are zero embeddings, as observed frames have;
+*unembedded* the same for models that the cameras reach in other ways, too: by warping the observed
+frame, by rays or by drawings, which stay as they are.
 *Copy* is a baseline without a network that repeats the observed frame; *warp*, for worlds that get
 it warped, shows it by its depth from the camera to which the actions lead, holes filled from the
 nearest pixel; *paint*, for worlds that draw the agent's arms, does so without the agent's body and
@@ -43,11 +44,11 @@ from pewm_jax.eval.walks import Walks, choose_walks
 from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.memory import rendering
-from pewm_jax.report.labels import PUBLISHED_FRAMES
+from pewm_jax.report.labels import steering_table
 from pewm_jax.types import Array, Control, Frames, Params
 from pewm_jax.worlds.control import control_of
 
-TRUE, SHUFFLED, NONE, TRUTH = "true", "shuffled", "none", "truth"
+TRUE, SHUFFLED, NONE, UNEMBEDDED, TRUTH = "true", "shuffled", "none", "unembedded", "truth"
 COPY, WARP, PAINT = "copy", "warp", "paint"
 """Kinds of actions; ``truth`` is the true clip, the ceiling of scores that need a segmentation."""
 ARMS_RGB = (163, 4, 162)
@@ -153,28 +154,8 @@ class Steered:
         return statistics.entries({**values, **gains}, self.walks.houses)
 
     def lines(self) -> list[str]:
-        """Return the tables as text: whole clips, and the frames of ``PUBLISHED_FRAMES``."""
-        out = [self.walks.about, "PSNR in dB, means over houses"]
-        out += _lines(self.table(), self.per_frame(), 2)
-        for found in self.facts()["scores"].values():
-            out += [f"{found['name']}, means over houses"]
-            out += _lines(found["all"], found["per_frame"], 3)
-        return out
-
-
-def _lines(whole: Mapping[str, Any], frames: Mapping[str, Any], digits: int) -> list[str]:
-    """Return a line per kind of actions: the mean, its interval, and the means at some frames."""
-    out = []
-    for name, found in whole.items():
-        low, high, mean = found["low"], found["high"], found["mean"]
-        span = "" if low is None else f"  [{low:.{digits}f}, {high:.{digits}f}]"
-        each = frames[name]["mean"]
-        at = [t for t in PUBLISHED_FRAMES if t <= len(each)]
-        known = [(t, each[t - 1]) for t in at if each[t - 1] is not None]
-        shown = "".join(f"  frame {t}: {value:.{digits}f}" for t, value in known)
-        number = "–" if mean is None else f"{mean:{digits + 4}.{digits}f}"
-        out.append(f"  {name:<16} {number}{span}{shown}")
-    return out
+        """Return a description of the clips, and the table as text."""
+        return [self.walks.about, *steering_table(self.facts()).text()]
 
 
 def measure(
@@ -262,9 +243,10 @@ class _Pieces:
         self.config, self.params, self.seed = config, params, seed
         self.episodes, self.walks, self.measures = episodes, walks, measures
         self.size = min(config.evaluate.batch, len(walks.choices))
-        self._silent = _with_zero_actions(config, params)
+        self._silent = _with_zero_actions(params)
         self._imagine = jax.jit(_imagined, static_argnums=0)
-        kinds = (TRUE, SHUFFLED, *([NONE] if self._silent is not None else []), COPY)
+        silent = NONE if _only_embeds(config) else UNEMBEDDED
+        kinds = (TRUE, SHUFFLED, *([silent] if self._silent is not None else []), COPY)
         kinds += (WARP,) if _warps(config) else ()
         kinds += (PAINT,) if _warps(config) and _draws_arms(config) else ()
         kinds += (TRUTH,) if measures.structure is not None or measures.arms else ()
@@ -288,7 +270,7 @@ class _Pieces:
             if kind in (WARP, PAINT):
                 rgb = _warped(self.config, context, padded, painted=kind == PAINT)
             else:
-                weights = self._silent if kind == NONE else self.params
+                weights = self._silent if kind in (NONE, UNEMBEDDED) else self.params
                 rgb = self._imagine(self.config, weights, context, padded, self.seed, numbers)
         off = jnp.square(unit_colours(rgb) - unit_colours(truth.rgb_THWC))
         found = {"errors": np.asarray(off.mean((2, 3, 4)))[:count]}
@@ -459,13 +441,14 @@ def _warped(config: Config, context: Frames, control: Any, painted: bool) -> Arr
     return jnp.where(arms, jnp.asarray(ARMS_RGB) / 127.5 - 1, rgb)
 
 
-def _with_zero_actions(config: Config, params: Params) -> Params | None:
-    """Return weights whose control embeds every action as zero, or None if there are none.
-
-    A warped observed frame, rays and drawings follow the actions as well.
-    """
+def _only_embeds(config: Config) -> bool:
+    """Return whether actions reach the model by their embedding alone."""
     control = getattr(config.model, "control", None)
-    embedded = config.model.capabilities.silent_actions and getattr(control, "only_embeds", True)
-    if not embedded or _sees_cameras(config) or "control" not in params:
+    return getattr(control, "only_embeds", True) and not _sees_cameras(config)
+
+
+def _with_zero_actions(params: Params) -> Params | None:
+    """Return weights whose control embeds every action as zero, or None if there are none."""
+    if "control" not in params:
         return None
     return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

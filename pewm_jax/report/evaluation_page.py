@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
 
 from pewm_jax.report.charts import METHOD_COLOURS, Line, LineChart
 from pewm_jax.report.labels import (
-    ACTIONS_NAMES,
     COVERAGE_NAMES,
     MASK_NAMES,
     METHOD_NAMES,
     METRIC_NAMES,
-    PUBLISHED_FRAMES,
     RIVALS,
-    TRUTH_NAME,
     heading,
     labelled,
     own_method,
+    steering_table,
     summary_lines,
     voxel_table,
 )
@@ -35,7 +33,7 @@ from pewm_jax.report.page import (
     render,
 )
 from pewm_jax.report.pictures import png
-from pewm_jax.report.table import Cell, Row, Table, row, with_error, with_interval
+from pewm_jax.report.table import Row, Table, row, with_error, with_frames, with_interval
 from pewm_jax.report.table import heading as heading_row
 
 INTRODUCTION = (
@@ -117,7 +115,7 @@ def evaluation_page(metrics: Mapping[str, Any], gallery: Gallery) -> str:
         figure = Figure(png(gallery.above), alt="the map from above", caption=gallery.above_note)
         above = Section("The map, from above", [figure])
     measured = (
-        *(scores, houses, steering, steering_scores, structure, videos),
+        *(scores, houses, steering, structure, videos),
         *(_frame_by_frame, drift, growth, mirror, coverage, voxels),
     )
     sections = [_rollouts(gallery), *(part(metrics) for part in measured), above]
@@ -205,7 +203,7 @@ def houses(metrics: Mapping[str, Any]) -> Section:
             for method, label in labelled(found[part]):
                 whole = found[part][method][mask]["psnr"]
                 by_frame = found[steps][method][mask]["psnr"]
-                cells = _whole_and_frames(whole, by_frame, ends, 2, sign=gain)
+                cells = with_frames(whole, by_frame, ends, 2, sign=gain)
                 shown = f"{minus} minus {label}" if gain else label
                 rows.append(row(shown, *cells, str(whole["houses"]), highlight=gain))
     heads = ["PSNR, dB", "all frames", *(f"frame {t + 1}" for t in ends), f"{found['house']}s"]
@@ -218,49 +216,6 @@ def houses(metrics: Mapping[str, Any]) -> Section:
     return Section.of_table("House by house", heads, rows, note)
 
 
-def _whole_and_frames(
-    whole: Mapping[str, Any],
-    steps: Mapping[str, Any],
-    ends: Sequence[int],
-    digits: int,
-    *,
-    sign: bool = False,
-) -> list[Cell]:
-    """Return the cells of a mean and of its values at some frames."""
-    at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in ends]
-    return [with_interval(entry, digits, sign=sign) for entry in (whole, *at)]
-
-
-def steering(metrics: Mapping[str, Any]) -> Section | None:
-    """Return PSNR with the true actions, with others and with none; None if not measured."""
-    found = metrics.get("steering")
-    if not found:
-        return None
-    ends = [0, len(found["per_frame"]["true"]["mean"]) - 1]
-    rows = [
-        row(
-            label,
-            *_whole_and_frames(
-                found["all"][name], found["per_frame"][name], ends, 2, sign="-" in name
-            ),
-            highlight="-" in name,
-        )
-        for name, label in ACTIONS_NAMES.items()
-        if name in found["all"]
-    ]
-    heads = ["PSNR, dB", "all frames", *(f"frame {t + 1}" for t in ends)]
-    recorded = found.get("recorded")
-    walks = "clips with the same noise" if recorded else "walks with the same noise"
-    note = (
-        f"{found['clips']} {walks}: {100 * found['forward']:.0f} % of their "
-        "steps go forward. Another clip's actions are those of a clip in another house; they "
-        f"differ in {100 * found['different']:.0f} % of the steps. Means over houses, in brackets "
-        "the interval of a bootstrap over them. A world that follows its actions is closest to the "
-        "ground truth with the true ones."
-    )
-    return Section.of_table("Do the actions steer the model?", heads, rows, note)
-
-
 STEERING_NOTES = {
     "lpips": "LPIPS is better the lower it is.",
     "scs": "SCS is 100 × IoU of the masks of objects, exact in the true clip and segmented in the "
@@ -271,29 +226,24 @@ STEERING_NOTES = {
 """Score of steered clips → a sentence about it."""
 
 
-def steering_scores(metrics: Mapping[str, Any]) -> Section | None:
-    """Return LPIPS, SCS and the IoU of arms by kind of actions; None if none was measured."""
-    found = (metrics.get("steering") or {}).get("scores")
+def steering(metrics: Mapping[str, Any]) -> Section | None:
+    """Return the scores by kind of actions; None if they were not measured."""
+    found = metrics.get("steering")
     if not found:
         return None
-    rows, columns = [], None
-    for name, one in found.items():
-        digits = 1 if name == "scs" else 3
-        frames = len(one["per_frame"]["true"]["mean"])
-        columns = sorted({0, *(t - 1 for t in PUBLISHED_FRAMES if t <= frames), frames - 1})
-        rows.append(heading_row(one["name"]))
-        labels = {**ACTIONS_NAMES, "truth": TRUTH_NAME}
-        for kind, label in labels.items():
-            if kind in one["all"]:
-                whole, steps = one["all"][kind], one["per_frame"][kind]
-                cells = _whole_and_frames(whole, steps, columns, digits, sign="-" in kind)
-                rows.append(row(label, *cells, highlight="-" in kind))
-    heads = ["", "all frames", *(f"frame {t + 1}" for t in columns or ())]
-    note = (
-        "The same clips as above; means over houses, in brackets the interval of a bootstrap over "
-        f"them. {' '.join(STEERING_NOTES[name] for name in found)}"
+    recorded = found.get("recorded")
+    walks = "clips with the same noise" if recorded else "walks with the same noise"
+    about = (
+        f"{found['clips']} {walks}: {100 * found['forward']:.0f} % of their "
+        "steps go forward. Another clip's actions are those of a clip in another house; they "
+        f"differ in {100 * found['different']:.0f} % of the steps. Means over houses, in brackets "
+        "the interval of a bootstrap over them. A world that follows its actions is closest to the "
+        "ground truth with the true ones."
     )
-    return Section.of_table("Do the actions steer objects and arms?", heads, rows, note)
+    notes = [about, *(STEERING_NOTES[name] for name in found.get("scores", {}))]
+    table = steering_table(found)
+    title = "Do the actions steer the model?"
+    return Section.of_table(title, table.header, table.rows, " ".join(notes))
 
 
 def structure(metrics: Mapping[str, Any]) -> Section | None:
@@ -308,7 +258,7 @@ def structure(metrics: Mapping[str, Any]) -> Section | None:
     }
     entries["the true clip"] = found["ceiling"], found["ceiling_per_frame"]
     rows = [
-        row(label, *_whole_and_frames(whole, steps, ends, 1), str(whole["houses"]))
+        row(label, *with_frames(whole, steps, ends, 1), str(whole["houses"]))
         for label, (whole, steps) in entries.items()
     ]
     heads = [found["name"], "all frames", *(f"frame {t + 1}" for t in ends), "houses"]

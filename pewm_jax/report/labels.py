@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
-from pewm_jax.report.table import Table, with_error, with_interval
+from pewm_jax.report.table import Table, row, with_error, with_frames, with_interval
+from pewm_jax.report.table import heading as heading_row
 
 METHOD_NAMES = {
     "memory": "with its map",
@@ -58,16 +59,20 @@ ACTIONS_NAMES = {
     "true": "the true actions",
     "shuffled": "another clip's actions",
     "none": "no actions",
+    "unembedded": "no actions embedded; cameras and drawings stay",
     "copy": "the observed frame, repeated",
     "warp": "the observed frame, warped",
     "paint": "the same without the body, and its bones painted",
     "true - shuffled": "true minus another clip's",
     "true - none": "true minus none",
+    "true - unembedded": "true minus those not embedded",
     "true - copy": "true minus the observed frame",
     "true - warp": "true minus the warped frame",
     "true - paint": "true minus the painted bones",
 }
 """Labels of the kinds of actions given to a model, and of their differences."""
+STEERING_DIGITS = {"psnr": 2, "lpips": 3, "scs": 1, "arms": 3}
+"""Digits of the scores by kind of actions."""
 TRUTH_NAME = "the true clip"
 """Label of the ceiling of scores that need a segmentation."""
 NONE_HOW = (
@@ -250,16 +255,28 @@ def format_steering(metrics: Mapping[str, Any]) -> list[str]:
         if name.startswith("true - ")
     )
     true = spread(found["all"]["true"], 2)
-    lines = [f"PSNR with the true actions is {true} dB; its lead over {'; over '.join(less)}."]
-    for one in found.get("scores", {}).values():
-        known = {"true": "true", "shuffled": "another clip's", "copy": "copying"}
-        values = (
-            f"{label} {spread(one['all'][kind], 3)}"
-            for kind, label in known.items()
-            if one["all"].get(kind, {}).get("mean") is not None
-        )
-        lines.append(f"{one['name']} with actions: {'; '.join(values)}.")
-    return [*lines, *compare_steering(found)]
+    first = f"PSNR with the true actions is {true} dB; its lead over {'; over '.join(less)}."
+    return [first, *compare_steering(found)]
+
+
+def steering_table(found: Mapping[str, Any]) -> Table:
+    """Return all scores by kind of actions: of all frames, and at some of them.
+
+    ``found`` is the entry ``steering`` of ``metrics.json``.
+    """
+    frames = len(found["per_frame"]["true"]["mean"])
+    columns = sorted({0, *(t - 1 for t in PUBLISHED_FRAMES if t <= frames), frames - 1})
+    rows = []
+    psnr = {"name": "PSNR, dB", **{key: found[key] for key in ("all", "per_frame")}}
+    for score, one in {"psnr": psnr, **found.get("scores", {})}.items():
+        rows.append(heading_row(one["name"]))
+        for kind, label in {**ACTIONS_NAMES, "truth": TRUTH_NAME}.items():
+            if kind in one["all"]:
+                whole, steps, less = one["all"][kind], one["per_frame"][kind], "-" in kind
+                digits = STEERING_DIGITS[score]
+                cells = with_frames(whole, steps, columns, digits, sign=less)
+                rows.append(row(label, *cells, highlight=less))
+    return Table(["", "all frames", *(f"frame {t + 1}" for t in columns)], rows)
 
 
 def compare_steering(found: Mapping[str, Any]) -> list[str]:
@@ -291,7 +308,7 @@ def compare_steering(found: Mapping[str, Any]) -> list[str]:
 
 VOXEL_ROWS = {
     "as trained": "as trained",
-    "persistence_logit": "persistence_logit 0, sampled in every frame",
+    "persistence_logit": "no known class is favoured, voxels sampled in every frame",
     "empty_prior": "empty_prior 0",
     "observation_logit": "observation_logit 0",
     "guesses": "guesses are not revised",
@@ -388,12 +405,14 @@ def summary_lines(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def score_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Return the PSNR of every method under every mask as aligned lines for the terminal."""
+    """Return the tables of PSNR, of steering and of voxels as aligned lines for the terminal."""
     results = metrics["results"]
     rows = [
         [label, *(with_error(results[method][mask]["psnr"], 2) for mask in MASK_NAMES)]
         for method, label in labelled(results)
     ]
     lines = Table.of(["PSNR, dB", *MASK_NAMES.values()], rows).text()
-    voxels = metrics.get("voxels")
-    return [*lines, *(voxel_table(voxels).text() if voxels else [])]
+    for name, table in (("steering", steering_table), ("voxels", voxel_table)):
+        if metrics.get(name):
+            lines += table(metrics[name]).text()
+    return lines

@@ -184,16 +184,20 @@ class Table:
         return file.getvalue()
 
     def text(self) -> list[str]:
-        """Return aligned lines for a terminal: the first column left, the others right."""
+        """Return aligned lines for a terminal: the first column left, the others right.
+
+        A heading is a line of its own.
+        """
         lines = [list(self.header), *([str(cell) for cell in line.cells] for line in self.rows)]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(self.header))]
-        return [
-            f"{line[0]:<{widths[0]}}"
-            + "".join(
-                f"  {text:>{width}}" for text, width in zip(line[1:], widths[1:], strict=True)
-            )
-            for line in lines
-        ]
+        whole = [line for line in lines if len(line) == len(self.header)]
+        widths = [max(len(line[k]) for line in whole) for k in range(len(self.header))]
+
+        def aligned(line: list[str]) -> str:
+            others = zip(line[1:], widths[1:], strict=False)
+            first = f"{line[0]:<{widths[0]}}" if line[1:] else line[0]
+            return first + "".join(f"  {text:>{width}}" for text, width in others)
+
+        return [aligned(line) for line in lines]
 
 
 def with_error(entry: Mapping[str, Any] | None, digits: int, *, sign: bool = False) -> Cell:
@@ -209,6 +213,19 @@ def with_interval(entry: Mapping[str, Any] | None, digits: int, *, sign: bool = 
         return Cell()
     ends = None if entry["low"] is None else (entry["low"], entry["high"])
     return Cell(entry["mean"], digits, interval=ends, sign=sign)
+
+
+def with_frames(
+    whole: Mapping[str, Any],
+    steps: Mapping[str, Any],
+    frames: Sequence[int],
+    digits: int,
+    *,
+    sign: bool = False,
+) -> list[Cell]:
+    """Return the cells of a mean and of its values at some frames, with their intervals."""
+    at = [{key: steps[key][t] for key in ("mean", "low", "high")} for t in frames]
+    return [with_interval(entry, digits, sign=sign) for entry in (whole, *at)]
 
 
 def with_half_width(entry: Mapping[str, Any] | None, digits: int, *, sign: bool = False) -> Cell:

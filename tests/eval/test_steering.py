@@ -68,7 +68,7 @@ def test_true_actions_are_compared_with_those_of_another_house_with_none_and_wit
     table = found.table()
     assert table["true - shuffled"]["houses"] == 3
     assert table["true - shuffled"]["low"] > 0
-    assert len(found.lines()) == 2 + len(ACTIONS_NAMES) - 4  # without warping and painting
+    assert len(found.lines()) == 3 + len(ACTIONS_NAMES) - 6  # nothing is warped or painted
     assert "75.0 % of the steps go forward" in found.lines()[0]
 
 
@@ -90,7 +90,7 @@ def test_a_report_keeps_its_pieces_and_says_what_came_out(obeying, monkeypatch, 
         steering.score(other, PARAMS, [], choices, partials, said.append)
     metrics = {"steering": found.facts(), "protocol": {"steering": about}}
     page = render("", [], [evaluation_page.steering(metrics)])
-    assert page.count("<tr") == 1 + len(ACTIONS_NAMES) - 4
+    assert page.count("<tr") == 2 + len(ACTIONS_NAMES) - 6
     assert f"{found.psnr['true'].mean():.2f} [" in page
     assert "75 % of their steps go forward" in page
     (sentence,) = format_steering(metrics)
@@ -139,7 +139,7 @@ def test_a_world_that_warps_its_observed_frame_is_compared_with_warping_alone(mo
     walks = Walks(clips, clips[::-1], np.full(2, 0.75), np.full(2, 0.75))
     monkeypatch.setattr(steering, "choose_walks", lambda *_: walks)
     found = steering.measure(config, PARAMS, [], 2)
-    assert set(found.psnr) == {"true", "shuffled", "copy", "warp"}
+    assert set(found.psnr) == {"true", "shuffled", "unembedded", "copy", "warp"}
     np.testing.assert_allclose(found.errors["copy"][:, 0], 0, atol=1e-6)
     assert (found.errors["copy"][:, 1] > 0.003).all()
     np.testing.assert_allclose(found.errors["warp"], 0, atol=1e-4)

@@ -129,19 +129,23 @@ def test_arms_and_objects_are_scored_by_kind_of_actions(told):
     assert arms["true"]["mean"] == pytest.approx(arms["truth"]["mean"])
     assert arms["true"]["mean"] > 0.8
     assert arms["shuffled"]["mean"] < 0.5 * arms["true"]["mean"]
-    assert "none" not in arms  # the warped frame would follow the actions
+    assert "none" not in arms  # the warped frame follows the actions
+    assert "unembedded" in arms
     assert arms["warp"]["mean"] < arms["paint"]["mean"] < arms["true"]["mean"]
     assert scs["true"]["mean"] == pytest.approx(scs["truth"]["mean"])
     assert scs["true"]["mean"] > scs["shuffled"]["mean"]
     assert facts["all"]["true"]["mean"] > 60
     assert "truth" not in facts["all"]
     assert len(facts["scores"]["arms"]["per_frame"]["true"]["mean"]) == 8
-    page = render("", [], [evaluation_page.steering_scores({"steering": facts})])
+    page = render("", [], [evaluation_page.steering({"steering": facts, "protocol": {}})])
     assert "IoU of the arms" in page
     assert "frame 8" in page
     sentences = format_steering({"steering": facts, "protocol": {}})
-    assert any(one.startswith("IoU of the arms with actions: true") for one in sentences)
-    assert any("frame 8:" in line for line in found.lines())
+    assert any(one.startswith("IoU of the arms, true actions / another") for one in sentences)
+    lines = found.lines()
+    assert "frame 8" in lines[1]
+    number = f"{arms['true']['mean']:.3f}"
+    assert any(number in line for line in lines[lines.index("IoU of the arms") :])
 
 
 def test_without_a_known_body_it_is_unknown_where_other_actions_lead():

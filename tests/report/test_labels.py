@@ -1,6 +1,7 @@
 """Sentences of a report."""
 
 from pewm_jax.report import labels
+from pewm_jax.report.table import Table, heading, row
 
 
 def growth(capacity):
@@ -32,3 +33,8 @@ def test_steering_is_compared_at_the_frames_of_the_paper():
         "SCS, true actions / another clip's: 1.50.",
     ]
     assert labels.compare_steering({}) == []
+
+
+def test_headings_of_a_table_are_lines_of_their_own_in_text():
+    table = Table(["", "all"], [heading("a long heading"), row("one", "1.25"), row("two", "20.5")])
+    assert table.text() == ["      all", "a long heading", "one  1.25", "two  20.5"]
