@@ -57,6 +57,7 @@ def config() -> Config:
         shifted_times=True,
         sample_steps=8,
         shift=3.0,
+        temperature=0.4,
     )
     backbone = dataclasses.replace(
         nets, voxel_vae=vae, world_frames=frames, renderer=renderer, camera_model=camera
@@ -90,7 +91,7 @@ def config() -> Config:
                 steps=2000, batch=3, learning_rate=4e-3, warmup=50, optimizer="adam"
             ),
             voxel_statistics=StageConfig(steps=60, batch=8, learning_rate=0.05, warmup=0),
-            world_frames=StageConfig(steps=8000, batch=8, learning_rate=1.5e-3, warmup=50),
+            world_frames=StageConfig(steps=5800, batch=8, learning_rate=1.5e-3, warmup=50),
             camera=StageConfig(steps=200, batch=16, learning_rate=1e-3, warmup=20),
             renderer=StageConfig(steps=8000, batch=4, learning_rate=1.5e-3, warmup=50),
             frames_per_clip=2,

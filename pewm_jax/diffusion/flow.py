@@ -27,8 +27,6 @@ class FlowConfig(Noise):
 
     shift: float = 1.0
     """Time shift s: t → s t / (1 + (s − 1) t); above 1 spends more steps near pure noise."""
-    sample_shift: float = 0.0
-    """Time shift of the sampler, if it is another than that of training; 0: `shift`."""
     times: Literal["uniform", "logit_normal"] = "uniform"
     """Distribution of times in training."""
     per_frame: bool = False
@@ -37,6 +35,9 @@ class FlowConfig(Noise):
     """Factor of t in the network's time input."""
     sample_steps: int = 10
     """Steps of the sampler, by Euler's method."""
+    temperature: float = 1.0
+    """Factor of the noise that the sampler starts from; below 1 samples vary less and are more
+    likely ones (reduced temperature, arXiv 1807.03039)."""
     guidance: float = 1.0
     """Classifier-free guidance on the memory (in the world egowm: on the observed image, or on the
     text of Cosmos): 1 = off, above 1 pushes away from 'no memory'."""
@@ -45,7 +46,7 @@ class FlowConfig(Noise):
         """Validate."""
         require_positive(self, "noise", "sample_steps")
         require_fields(self, "noise", lambda value: value > 0, "a number above 0", "shift", "scale")
-        require_fields(self, "noise", lambda value: value >= 0, "0 or more", "sample_shift")
+        require_fields(self, "noise", lambda x: 0 <= x <= 1, "a factor from 0 to 1", "temperature")
 
     @property
     def velocity_in_unit_time(self) -> bool:
@@ -83,11 +84,10 @@ class FlowConfig(Noise):
 
     def levels(self) -> np.ndarray:
         """Return (sample_steps,) times from 1 downwards, shifted."""
-        even = np.linspace(1, 0, self.sample_steps + 1)[:-1]
-        return np.asarray(self._shifted(even, sampler=True))
+        return np.asarray(self._shifted(np.linspace(1, 0, self.sample_steps + 1)[:-1]))
 
     def sample(self, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
-        """Follow the flow from t = 1 to 0 by Euler's method."""
+        """Follow the flow from t = 1, with noise of ``temperature``, to 0 by Euler's method."""
         del key
         times = np.asarray(self.levels(), np.float32)
         after = np.append(times[1:], np.float32(0))
@@ -98,13 +98,17 @@ class FlowConfig(Noise):
             velocity = (x - x0) / now
             return (x + (then - now) * velocity).astype(x.dtype), None
 
-        out, _ = jax.lax.scan(step, noise, (jnp.asarray(times), jnp.asarray(after)))
+        start = self._start(noise)
+        out, _ = jax.lax.scan(step, start, (jnp.asarray(times), jnp.asarray(after)))
         return out
 
-    def _shifted(self, time: Any, sampler: bool = False) -> Any:
+    def _start(self, noise: Array) -> Array:
+        """Return what the sampler starts from."""
+        return noise if self.temperature == 1 else noise * self.temperature
+
+    def _shifted(self, time: Any) -> Any:
         """Return s t / (1 + (s − 1) t)."""
-        shift = self.sample_shift or self.shift if sampler else self.shift
-        return shift * time / (1 + (shift - 1) * time)
+        return self.shift * time / (1 + (self.shift - 1) * time)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -191,7 +195,7 @@ class FrameFlowConfig(FlowConfig):
         return ((1 - least) * x_t - x0) / (least + (1 - least) * time)
 
     def sample(self, denoise: Denoiser, noise: Array, key: Array | None = None) -> Array:
-        """Follow the flow from t = 1 by Euler's method.
+        """Follow the flow from t = 1, with noise of ``temperature``, by Euler's method.
 
         The sample is the last step's x0, without the noise s ε that is left at t = 0.
         """
@@ -206,7 +210,8 @@ class FrameFlowConfig(FlowConfig):
             return ((x + (then - now) * self.velocity(x0, x, time_B)).astype(x.dtype), x0), None
 
         rows = (jnp.asarray(times), jnp.asarray(after))
-        (_, x0), _ = jax.lax.scan(step, (noise, noise), rows)
+        start = self._start(noise)
+        (_, x0), _ = jax.lax.scan(step, (start, start), rows)
         return x0
 
 

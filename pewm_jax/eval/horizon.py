@@ -321,8 +321,8 @@ def sentences(facts: Mapping[str, Any]) -> list[str]:
             f"({100 * edits['share_of_cells']:.0f} % of their cells; {edits['without_room']} more "
             f"walks had no room); in {edits['frames_in_window']} of {edits['frames']} frames a "
             "part was in the window that may change, where a known cell changes if another class "
-            f"is likelier by {edits['hold']:g} nats. The image changed at the block in "
-            f"{edits['changed_in_sight']} of {edits['frames_in_sight']} frames in which it was "
+            f"is likelier by {edits['persistence_logit']:g} nats. The image changed at the block "
+            f"in {edits['changed_in_sight']} of {edits['frames_in_sight']} frames in which it was "
             "visible."
         )
     return said

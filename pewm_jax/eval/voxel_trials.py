@@ -76,7 +76,7 @@ class Trials:
             "changed_in_sight": int(self.visible),
             "frames": int(self.frames),
             "frames_in_window": int(self.within),
-            "hold": float(self.persistence_logit),
+            "persistence_logit": float(self.persistence_logit),
         }
 
 

@@ -79,9 +79,19 @@ def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
     even = np.linspace(1, 0, 21)[:-1]
     np.testing.assert_allclose(config.levels(), 3 * even / (1 + 2 * even), rtol=1e-6)
     assert FrameFlowConfig.levels is FlowConfig.levels
-    other = dataclasses.replace(config, sample_shift=0.5, shifted_times=True)
-    np.testing.assert_allclose(other.levels(), 0.5 * even / (1 - 0.5 * even), rtol=1e-6)
-    np.testing.assert_array_equal(other.draw(jax.random.key(0), 400, 5), shifted)
+
+
+@pytest.mark.parametrize("config", [FlowConfig(), FrameFlowConfig()])
+def test_with_a_temperature_the_sampler_starts_from_less_noise(config):
+    noise = jax.random.normal(jax.random.key(3), (2, 3, 4))
+
+    def denoise(x, time_B, weight):
+        return 0.3 * x
+
+    cold = dataclasses.replace(config, temperature=0.4)
+    wanted = config.sample(denoise, 0.4 * noise)
+    np.testing.assert_allclose(cold.sample(denoise, noise), wanted, rtol=1e-6)
+    assert np.abs(wanted).max() < 0.5 * np.abs(config.sample(denoise, noise)).max()
 
 
 def test_given_frames_have_a_little_noise_and_say_so():
@@ -93,7 +103,7 @@ def test_given_frames_have_a_little_noise_and_say_so():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"smallest": 1.0}, {"context_noise": -0.1}, {"shift": 0.0}, {"sample_shift": -1.0}]
+    "wrong", [{"smallest": 1.0}, {"context_noise": -0.1}, {"shift": 0.0}, {"temperature": 1.5}]
 )
 def test_settings_that_cannot_work_are_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
