@@ -243,7 +243,7 @@ class _Pieces:
         self.config, self.params, self.seed = config, params, seed
         self.episodes, self.walks, self.measures = episodes, walks, measures
         self.size = min(config.evaluate.batch, len(walks.choices))
-        self._silent = _with_zero_actions(params)
+        self._silent = _with_zero_actions(config, params)
         self._imagine = jax.jit(_imagined, static_argnums=0)
         silent = NONE if _only_embeds(config) else UNEMBEDDED
         kinds = (TRUE, SHUFFLED, *([silent] if self._silent is not None else []), COPY)
@@ -447,8 +447,8 @@ def _only_embeds(config: Config) -> bool:
     return getattr(control, "only_embeds", True) and not _sees_cameras(config)
 
 
-def _with_zero_actions(params: Params) -> Params | None:
+def _with_zero_actions(config: Config, params: Params) -> Params | None:
     """Return weights whose control embeds every action as zero, or None if there are none."""
-    if "control" not in params:
+    if not config.model.capabilities.silent_actions or "control" not in params:
         return None
     return {**params, "control": jax.tree.map(jnp.zeros_like, params["control"])}

@@ -59,7 +59,7 @@ ACTIONS_NAMES = {
     "true": "the true actions",
     "shuffled": "another clip's actions",
     "none": "no actions",
-    "unembedded": "no actions embedded; cameras and drawings stay",
+    "unembedded": "actions not embedded; cameras and drawings stay",
     "copy": "the observed frame, repeated",
     "warp": "the observed frame, warped",
     "paint": "the same without the body, and its bones painted",
