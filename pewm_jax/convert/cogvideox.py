@@ -23,7 +23,7 @@ import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -41,6 +41,7 @@ from pewm_jax.models.cogvideox.convert import TRANSFORMER, VAE
 from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.types import Params
 from pewm_jax.worlds import lora
+from pewm_jax.worlds.egowm import paper as egowm_paper
 from pewm_jax.worlds.pewm import paper
 
 PIPELINES = (
@@ -223,13 +224,7 @@ def config_of(
     Raises:
         ConfigError: the network does not support the size.
     """
-    usual = dataclasses.astuple(paper.CLIP)[:3]
-    if dit.positions == "rope_learned" and dit.learned in ("exact", "reference"):
-        scale = vae.spatial
-        usual = (dit.sample_frames, dit.sample_height * scale, dit.sample_width * scale)
-    frames, height, width = (
-        value if given is None else given for given, value in zip(size, usual, strict=True)
-    )
+    frames, height, width = _size(dit, vae, size, dataclasses.astuple(paper.CLIP)[:3])
     return paper.experiment(
         dit,
         vae,
@@ -237,8 +232,58 @@ def config_of(
         run=run,
         clip=ClipConfig(frames=frames, height=height, width=width),
         encoder=encoder,
-        dtype="float32" if dtype in (None, "float32") else "bfloat16",
+        dtype=_computed(dtype),
     )
+
+
+def actions_config_of(
+    dit: DiTBackbone,
+    vae: VAECodec,
+    noise: DDPMConfig,
+    size: tuple[int | None, int | None, int | None],
+    dtype: str | None,
+    *,
+    run: str = "world",
+) -> Config:
+    """Return the settings of the world model controlled by actions; see ``config_of``.
+
+    They are those of the preset ``egowm_cogvideox``, whose clip has 17 × 480 × 720.
+
+    Raises:
+        UserError: the network does not take an image.
+        ConfigError: the network does not support the size.
+    """
+    latents = vae.latent_channels
+    if (dit.in_channels, dit.out_channels) != (2 * latents, latents):
+        raise UserError(
+            f"The transformer has {dit.in_channels} input and {dit.out_channels} output channels; "
+            f"one for --actions takes the {latents} of the autoencoder's latents twice, the second "
+            "time those of the observed image: import an image-to-video checkpoint."
+        )
+    clip = _size(dit, vae, size, egowm_paper.COGVIDEOX_CLIP)
+    return egowm_paper.cogvideox_experiment(
+        dit, vae, noise, run=run, clip=clip, dtype=_computed(dtype)
+    )
+
+
+def _size(
+    dit: DiTBackbone,
+    vae: VAECodec,
+    asked: tuple[int | None, int | None, int | None],
+    usual: tuple[int, int, int],
+) -> tuple[int, int, int]:
+    """Return frames, height and width: what was asked, or what learned positions allow."""
+    if dit.positions == "rope_learned" and dit.learned in ("exact", "reference"):
+        scale = vae.spatial
+        usual = (dit.sample_frames, dit.sample_height * scale, dit.sample_width * scale)
+    frames, height, width = (
+        value if given is None else given for given, value in zip(asked, usual, strict=True)
+    )
+    return frames, height, width
+
+
+def _computed(dtype: str | None) -> Literal["float32", "bfloat16"]:
+    return "float32" if dtype in (None, "float32") else "bfloat16"
 
 
 def require_size(config: Config) -> None:
@@ -317,6 +362,30 @@ def import_world(
     pipeline.write_world(dst, config, parts, {BASE: record})
 
 
+def import_actions(
+    src: Path,
+    dst: Path,
+    config: Config,
+    prompt_LC: np.ndarray | None,
+    record: dict[str, Any],
+    *,
+    dtype: str | None = None,
+) -> None:
+    """Write the folder of a world model controlled by actions; arguments as ``import_world``.
+
+    ``config`` is that of ``actions_config_of``. The actions' layers are new and in float32.
+    """
+    parts: dict[str, pipeline.Part] = {
+        "backbone": pipeline.part(TRANSFORMER, src, dtype),
+        "codec": pipeline.part(VAE, src, dtype),
+        "control": pipeline.fresh_actions(config, dtype),
+    }
+    if prompt_LC is not None:
+        tokens: Params = {"prompt_LC": prompt_LC}
+        parts["text"] = pipeline.made(tokens, lambda: tokens, dtype)
+    pipeline.write_world(dst, config, parts, {BASE: record})
+
+
 def export(
     src: Path,
     dst: Path,
@@ -379,12 +448,13 @@ def _run(src: Path, network: Network, record: dict[str, Any]) -> Params:
     if network is VAE:
         params = weights.load(path, "codec")
     else:
-        old = network.config(record[network.folder], BASE)
-        vae = VAE.config(record[VAE.folder], BASE)
-        plan = widen.plan(old, vae.latent_channels, config.model.control.channels(config.model))
-        backbone = weights.load(path, "backbone")
-        weights.check(backbone, network.like(plan.new), f"the backbone in {path}")
-        params = widen.narrow(plan, backbone)
+        params = weights.load(path, "backbone")
+        if config.model.codec.depth_channels:
+            old = network.config(record[network.folder], BASE)
+            vae = VAE.config(record[VAE.folder], BASE)
+            plan = widen.plan(old, vae.latent_channels, config.model.control.channels(config.model))
+            weights.check(params, network.like(plan.new), f"the backbone in {path}")
+            params = widen.narrow(plan, params)
     like = network.like(network.config(record[network.folder], BASE))
     weights.check(params, like, f"the {network.folder} in {path}")
     return params

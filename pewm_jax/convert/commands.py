@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Literal, TypeVar
 
@@ -99,7 +100,7 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
     noise = cogvideox.read_scheduler(src)
     for network in (TRANSFORMER, VAE):  # check all files before hours of work
         pipeline.specs(network, src, options.dtype)
-    config, encoder = _world(options, dit, vae, noise) if options.rgbd else (None, None)
+    config, encoder = _world(options, dit, vae, noise) if options.world else (None, None)
     prompts = text.encode(src, options.prompt, dit.text_length, dit.text_dim)
     record = cogvideox.describe_base(src, settings, list(prompts), options.dtype)
     if config is None:
@@ -109,17 +110,12 @@ def import_cogvideox(options: ImportCogVideoX) -> None:
         tokens: Literal["zeros", "stored"] = "zeros" if prompt is None else "stored"
         backbone = dataclasses.replace(config.model.backbone, prompt=tokens)
         config = config.with_model(backbone=backbone)
-        cogvideox.import_world(
-            src,
-            dst,
-            config,
-            prompt,
-            record,
-            memory=options.memory,
-            encoder=encoder,
-            dtype=options.dtype,
-            seed=options.seed,
-        )
+        write = cogvideox.import_actions
+        if options.rgbd:
+            write = functools.partial(
+                cogvideox.import_world, memory=options.memory, encoder=encoder, seed=options.seed
+            )
+        write(src, dst, config, prompt, record, dtype=options.dtype)
     print(f"{dst}: {_summary(options, prompts)}; licence of the original: {record['licence']}")
 
 
@@ -132,14 +128,21 @@ def _world(
         UserError: invalid settings, or a required encoder is not given.
     """
     size = (options.frames, options.height, options.width)
+    dit = _with_positions(dit, options.positions)
+    dtype, run = _stored_dtype(options), options.dst.name
+    if options.actions:
+        config = cogvideox.actions_config_of(dit, vae, noise, size, dtype, run=run)
+        config = overlay(config, options.config) if options.config else config
+        cogvideox.require_size(config)
+        return config, None
     network, params = dinov2_model.load(options.encoder) if options.encoder else (None, None)
     config = cogvideox.config_of(
-        _with_positions(dit, options.positions),
+        dit,
         vae,
         noise,
         size,
-        _stored_dtype(options),
-        run=options.dst.name,
+        dtype,
+        run=run,
         encoder=DINOv2EncoderConfig(network=network) if network else None,
     )
     config = overlay(config, options.config) if options.config else config
@@ -182,7 +185,9 @@ def _stored_dtype(options: ImportCogVideoX) -> str:
 
 def _summary(options: ImportCogVideoX, prompts: dict[str, np.ndarray]) -> str:
     what = "CogVideoX in our layout"
-    if options.rgbd:
+    if options.actions:
+        what = "a world model controlled by actions"
+    elif options.rgbd:
         what = "a world model" + " with memory blocks" * options.memory
     if not prompts:
         return f"{what}, no prompt (there is no text_encoder/)"

@@ -23,8 +23,10 @@ class ImportCogVideoX:
     depth, the observed frame and the camera become inputs, depth becomes an output; --memory adds
     the blocks that read the map. The result is a folder that `pewm_jax.load` reads and that can be
     trained by its name (`pewm-jax train DST`), with the settings of the presets pewm_2b and
-    pewm_5b. Before training it predicts the colours of the original. Without these flags the
-    networks are only converted to our layout.
+    pewm_5b. Before training it predicts the colours of the original. With --actions an
+    image-to-video checkpoint becomes a world model controlled by actions, as by `import svd`, with
+    the settings of the preset egowm_cogvideox; before training, actions have no effect. Without
+    these flags the networks are only converted to our layout.
     """
 
     REPEATED: ClassVar[tuple[str, ...]] = ("--prompt",)
@@ -45,16 +47,21 @@ class ImportCogVideoX:
     """Widen for the camera; needs --rgbd."""
     memory: bool = False
     """Add memory blocks; they have no effect until they are trained."""
+    actions: bool = False
+    """Make a world model controlled by actions, without depth, camera and memory."""
     frames: int | None = None
-    """Frames of the world model's clips: 8k + 1; by default 9, or the size of learned positions."""
+    """Frames of the world model's clips: 8k + 1; by default 9, with --actions 17, or the size of
+    learned positions."""
     positions: Learned | None = None
     """Treatment of learned positions (5b-I2V) for clips of other sizes than 49 × 480 × 720:
     `interpolate` resizes their table, `drop` removes it, `reference` replaces it with a fixed
     sinusoid for other numbers of frames, `exact` raises an error. By default `exact`."""
     height: int | None = None
-    """Height of its images in pixels; by default 512, or the size of learned positions."""
+    """Height of its images in pixels; by default 512, with --actions 480, or the size of learned
+    positions."""
     width: int | None = None
-    """Width of its images in pixels; by default 512, or the size of learned positions."""
+    """Width of its images in pixels; by default 512, with --actions 720, or the size of learned
+    positions."""
     encoder: Path | None = None
     """Folder of `import dinov2`, the encoder of the map's image features; by default the colours of
     patches."""
@@ -73,7 +80,9 @@ class ImportCogVideoX:
             )
         if not self.prompt:
             raise ConfigError('--prompt was given no prompt; the empty one is --prompt "".')
-        if self.rgbd:
+        if self.actions:
+            self._require_no_map()
+        if self.world:
             if len(set(self.prompt)) > 1:
                 raise ConfigError(
                     f"--prompt names {len(self.prompt)} prompts: a world model takes one."
@@ -83,7 +92,22 @@ class ImportCogVideoX:
             raise ConfigError("--memory was given without --rgbd --camera; add them.")
         for name in ("frames", "height", "width", "positions", "encoder", "config"):
             if getattr(self, name) is not None:
-                raise ConfigError(f"--{name} is a setting of a world model; add --rgbd --camera.")
+                raise ConfigError(
+                    f"--{name} is a setting of a world model; add --rgbd --camera, or --actions."
+                )
+
+    @property
+    def world(self) -> bool:
+        """Whether the result is a world model."""
+        return self.rgbd or self.actions
+
+    def _require_no_map(self) -> None:
+        for name in ("rgbd", "memory", "encoder"):
+            if getattr(self, name):
+                raise ConfigError(
+                    f"--actions was given with --{name}: it makes a world model without a map; "
+                    "omit one of the two."
+                )
 
 
 @dataclasses.dataclass(frozen=True)

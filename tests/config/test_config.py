@@ -384,6 +384,7 @@ def test_large_presets_have_the_decays_of_their_sources():
         "pewm_5b": 0.95,
         "pewm_5b_i2v": 0.95,
         "egowm_cosmos2b": 0.99,
+        "egowm_cogvideox": 0.95,
         "persist_xl": 0.99,
         "egowm_svd": 0.999,
         "tiny": 0.999,

@@ -16,6 +16,7 @@ from diffusers import (
     CogVideoXImageToVideoPipeline,
     CogVideoXTransformer3DModel,
 )
+from diffusers.models.embeddings import get_3d_rotary_pos_embed
 from transformers import AutoTokenizer, T5EncoderModel
 
 import pewm_jax
@@ -28,9 +29,10 @@ from pewm_jax.io.published import LINEAR, Entry
 from pewm_jax.models.cogvideox import model as dit
 from pewm_jax.models.cogvideox.backbone import DiTBackbone
 from pewm_jax.models.interface import Conditioning
-from pewm_jax.types import Camera, MapTokens, MemoryReadout
+from pewm_jax.types import Camera, Control, MapTokens, MemoryReadout
 from pewm_jax.worlds import world_model
 from tests.convert import pipelines
+from tests.helpers import random_frames
 
 WORLD = ["--rgbd", "--camera", "--memory", "--frames", "9", "--height", "32", "--width", "32"]
 
@@ -270,6 +272,58 @@ def test_the_video_model_in_a_training_run_is_exported(widened, tmp_path):
     run("export", "diffusers", widened, tmp_path / "at_once")
     plain = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "at_once/transformer")
     require_equal(plain, pipelines.dit("5b-I2V"))
+
+
+def test_with_actions_it_is_the_original_until_they_are_trained(images, tmp_path):
+    dst = tmp_path / "dst"
+    run("import", "cogvideox", images, dst, "--actions")
+    config, params = pewm_jax.load(dst)
+    model = config.model
+    assert set(params) == {"backbone", "codec", "control", "text"}
+    assert (model.latent_shape, model.in_channels) == ((3, 4, 4), 8)
+    rng = np.random.default_rng(0)
+    observed = jax.tree.map(lambda x: jnp.asarray(x)[None], random_frames(rng, 1, 32, 32))
+    actions = jnp.asarray(rng.normal(size=(1, 8, 3)), jnp.float32)
+    camera = jax.tree.map(lambda x: jnp.repeat(x, 9, 1), observed.camera)
+    noisy = jnp.asarray(rng.normal(size=(1, 3, 4, 4, 4)), jnp.float32)
+    times = jnp.array([700])
+
+    @jax.jit
+    def predict(params, actions):
+        given = world_model.condition(model, params, observed, Control(camera, actions))
+        return world_model.apply(model, params, noisy, given, times), given.backbone
+
+    got, given = predict(params, actions)
+    torch_input = torch.from_numpy(np.array(jnp.concatenate([noisy, given.joined_BthwC], -1)))
+    with torch.no_grad():
+        want = pipelines.dit("5b-I2V")(
+            torch_input.permute(0, 1, 4, 2, 3),
+            torch.from_numpy(np.array(given.tokens_BLC)),
+            torch.tensor([700]),
+            image_rotary_emb=get_3d_rotary_pos_embed(16, ((0, 0), (2, 2)), (2, 2), 3),
+        ).sample.permute(0, 1, 3, 4, 2)
+    assert not np.any(given.joined_BthwC[:, 1:])
+    np.testing.assert_allclose(got, want.numpy(), atol=1e-4)
+
+    trained = jax.tree.map(lambda x: x + 0.1, params["control"])
+    steered = [predict({**params, "control": trained}, a)[0] for a in (actions, -actions)]
+    assert np.abs(steered[0] - steered[1]).max() > 1e-3
+    run("export", "diffusers", dst, tmp_path / "back")
+    back = CogVideoXTransformer3DModel.from_pretrained(tmp_path / "back/transformer")
+    require_equal(back, pipelines.dit("5b-I2V"))
+
+
+def test_the_preset_with_actions_takes_the_published_network_as_it_is():
+    preset = presets.load("egowm_cogvideox")
+    settings = dataclasses.replace(preset.model.backbone, learned="interpolate", remat=False)
+    published = DiTBackbone.published("5b-I2V")
+    made = cogvideox.actions_config_of(
+        settings, preset.model.codec, preset.model.noise, (None,) * 3, "bfloat16", run="a"
+    )
+    assert without(made.train, "run") == without(preset.train, "run")
+    assert made.model == preset.model
+    assert preset.model.in_channels == published.in_channels
+    assert preset.model.codec.channels == published.out_channels
 
 
 @pytest.mark.slow

@@ -232,6 +232,8 @@ def test_a_failure_in_the_middle_leaves_nothing(src, capsys):
         (["--rgbd", "--camera", "--height", "40"], "multiples of"),
         (["--rgbd", "--camera", "--prompt", "a", "b"], "a world model takes one"),
         (["--positions", "drop"], "--positions is a setting of a world model"),
+        (["--actions", "--memory"], "--actions was given with --memory"),
+        (["--actions"], "import an image-to-video checkpoint"),
         (["--rgbd", "--camera", "--positions", "drop"], "this transformer has none"),
         (["--dtype", "float8"], "float8"),
         (["--memmory"], "did you mean --memory?"),

@@ -105,7 +105,7 @@ def test_rematerialization_is_found_in_every_preset_s_networks():
             for part in path.split("."):
                 value = getattr(value, part)
             assert value is True, (name, path)
-        if name in ("pewm_2b", "egowm_svd", "egowm_cosmos2b"):
+        if name in ("pewm_2b", "egowm_svd", "egowm_cosmos2b", "egowm_cogvideox"):
             assert paths == ["backbone.remat"]
     assert len(fit.remat_settings(presets.load("persist_xl").model)) >= 2
 

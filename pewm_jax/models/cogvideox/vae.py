@@ -50,6 +50,10 @@ _log = logging.getLogger(__name__)
 class VAECodec(VAEConfig, PublishedVAE):
     """The video autoencoder of CogVideoX; its weights come from a converted checkpoint."""
 
+    depth: bool = True
+    """Whether depth is encoded too, as grey pictures by the same weights, in as many channels more;
+    CogVideoX itself knows colour alone."""
+
     def check(self, model: Any) -> None:
         """Refuse clips that cannot be encoded, or decode to another number of frames."""
         super().check(model)

@@ -10,7 +10,10 @@ from pewm_jax.config.experiment import Config
 from pewm_jax.config.training import DataConfig, EvalConfig, MeshConfig, StageConfig
 from pewm_jax.config.world import ClipConfig
 from pewm_jax.controls.actions import ModulationConfig
+from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
+from pewm_jax.models.cogvideox.backbone import DiTBackbone
+from pewm_jax.models.cogvideox.vae import VAECodec
 from pewm_jax.models.cosmos.backbone import CosmosBackbone
 from pewm_jax.models.svd.unet import SVDUNetBackbone
 from pewm_jax.models.svd.vae import SVDVAECodec
@@ -25,6 +28,11 @@ COSMOS_NOISE = EDMConfig(sigma_data=1.0, target="flow", ends="sigma_min", sample
 """The scheduler of Cosmos-Predict2, as its published pipeline uses it."""
 COSMOS_CLIP = (17, 480, 640)
 """Frames, height and width of the paper's clips with Cosmos: 16 frames after the observed one."""
+COGVIDEOX_NOISE = DDPMConfig(target="v", snr_shift=1.0, sample_steps=50)
+"""The scheduler of CogVideoX-5b-I2V, as its published pipeline uses it."""
+COGVIDEOX_CLIP = (17, 480, 720)
+"""Frames, height and width with CogVideoX, which the paper does not use: the published images, and
+as many frames as with Cosmos."""
 
 
 def experiment(
@@ -102,6 +110,49 @@ def cosmos_experiment(
             image_noise_mean=-10.0,
             image_noise_std=0.0,
             beta2=0.99,
+            ema=0.9999,
+            preview_every=0,
+        ),
+        evaluate=EvalConfig(batch=1),
+    )
+
+
+def cogvideox_experiment(
+    transformer: DiTBackbone,
+    vae: VAECodec,
+    noise: DDPMConfig = COGVIDEOX_NOISE,
+    *,
+    run: str,
+    clip: tuple[int, int, int] = COGVIDEOX_CLIP,
+    dtype: Literal["float32", "bfloat16"] = "bfloat16",
+) -> Config:
+    """Return the method of the paper on CogVideoX for images; arguments as for ``experiment``.
+
+    The paper has no CogVideoX. As with Cosmos, whose autoencoder also covers four frames by a
+    latent one, the actions' layers are two layers and two convolutions over time, ten times as
+    fast. The observed frame is where the published network expects it: its latents are further
+    input channels of the first latent frame, zeros of the others. Adam's decays are those of
+    CogVideoX's own fine-tuning (0.9 and 0.95; CogVideo's ``sat/configs/sft.yaml``); steps, batch
+    and learning rate are ours.
+    """
+    frames, height, width = clip
+    return Config(
+        model=EgoWM(
+            clip=ClipConfig(frames=frames, height=height, width=width, depth=False),
+            codec=dataclasses.replace(vae, depth=False),
+            backbone=dataclasses.replace(transformer, remat=True),
+            control=ModulationConfig(projection="convolution"),
+            noise=noise,
+            dtype=dtype,
+        ),
+        data=DataConfig(path="data/egowm", context=1, stride_max=1),
+        train=EgoWMTrainConfig(
+            run=f"runs/{run}",
+            adapt=StageConfig(steps=20000, batch=8, learning_rate=1e-5, warmup=500),
+            mesh=MeshConfig(fsdp=8),
+            image_noise_mean=-10.0,
+            image_noise_std=0.0,
+            beta2=0.95,
             ema=0.9999,
             preview_every=0,
         ),
