@@ -274,6 +274,29 @@ def test_the_numbers_are_those_that_were_recorded():
     assert "with its memory | 24.60" in page
 
 
+@pytest.mark.parametrize("name", ["egowm", "egowm-humanoid"])
+def test_the_page_of_egowm_has_the_numbers_of_the_cards(name):
+    """A row of the page has the mean of every score that the row of the card has, in its order."""
+
+    def rows(path):
+        found = {}
+        for line in (ROOT / path).read_text().splitlines():
+            name, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+            if line.startswith("| ") and len(cells) > 4:
+                found.setdefault(name, []).append([re.sub(r" \(.*", "", x) for x in cells])
+        return found
+
+    def within(some, whole):
+        rest = iter(whole)
+        return all(value in rest for value in some)
+
+    card, page = rows(f"pewm_jax/shipped/{name}/README.md"), rows("docs/egowm.md")
+    names = {"true actions", "another clip's actions", "the true clip"}
+    assert names <= card.keys() & page.keys()
+    for row in card.keys() & page.keys() - {name for name in card if "mean over" in name}:
+        assert any(within(one, card[row][0]) for one in page[row]), row
+
+
 def test_a_notebook_becomes_a_page_with_its_pictures():
     text, pictures = pages.notebook(NOTEBOOKS[0])
     assert text.startswith("# A first rollout")
