@@ -74,6 +74,7 @@ def config() -> Config:
             observation_logit=200.0,
             shown_logit=8.0,
             guess_logit=2.0,
+            body_m=0.2,
             sampled="new",
         ),
         data=dataclasses.replace(

@@ -25,6 +25,7 @@ HOMES = {
     "pewm_jax/shipped/small/README.md": "cards/small.md",
     "pewm_jax/shipped/egowm/README.md": "cards/egowm.md",
     "pewm_jax/shipped/egowm-humanoid/README.md": "cards/egowm-humanoid.md",
+    "pewm_jax/shipped/persist/README.md": "cards/persist.md",
     "pewm_jax/shipped/codec/README.md": "cards/codec.md",
     "pewm_jax/shipped/codec-2/README.md": "cards/codec-2.md",
 }

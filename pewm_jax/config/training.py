@@ -461,8 +461,9 @@ class EvalConfig:
     """Other worlds (folders of runs, or names of models that ship) that imagine the long walks."""
     mechanisms: Literal["off", "on"] = "off"
     """Add rows to the scores of a world of voxels, each with one of its mechanisms switched off:
-    `persistence_logit`, `empty_prior`, `observation_logit`, the revision of guesses, the rule that
-    voxels are sampled only where cells are new, and the sampling steps (one instead of several)."""
+    `persistence_logit`, `empty_prior`, `observation_logit`, the revision of guesses, the
+    agent's body, the rule that voxels are sampled only where cells are new, and the sampling steps
+    (one instead of several)."""
     protocol: str = ""
     """File written by `pewm-jax protocol` before training: the clips that are scored, with their
     context, motion and noise; it stands above the settings here. If empty, or `off`, clips are

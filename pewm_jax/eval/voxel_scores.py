@@ -53,6 +53,7 @@ MECHANISMS: dict[str, dict[str, Any]] = {
     "empty_prior": {"empty_prior": 0.0},
     "observation_logit": {"observation_logit": 0.0},
     "guesses": {"shown_logit": -1.0, "guess_logit": -1.0},
+    "body": {"body_m": 0.0},
     "sampled": {"sampled": "always"},
     "sample_steps": {"voxel_noise": {"sample_steps": 1}},
 }

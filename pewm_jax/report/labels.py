@@ -312,6 +312,7 @@ VOXEL_ROWS = {
     "empty_prior": "empty_prior 0",
     "observation_logit": "observation_logit 0",
     "guesses": "guesses are not revised",
+    "body": "the cells that the agent stands in stay as imagined",
     "sampled": "voxels are sampled in every frame",
     "sample_steps": "voxels are sampled in one step",
 }

@@ -1,4 +1,4 @@
-"""The scripts behind the pictures and tables of the page of EgoWM."""
+"""The scripts behind the pictures and tables of the pages of EgoWM and PERSIST."""
 
 import sys
 from pathlib import Path
@@ -51,3 +51,21 @@ def test_steering_is_printed_with_its_margins(humanoid, monkeypatch, capsys):
     for row in ("true actions", "another clip's actions", "the observed frame, repeated"):
         assert row in said
     sys.modules.pop("egowm_steering")
+
+
+@pytest.mark.slow
+def test_pictures_of_a_world_of_voxels_are_drawn(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    import persist_pictures
+
+    data = tmp_path / "data"
+    collect = f"data collect {data} --moving --train 0 --validation 0 --test 1 --frames 12"
+    voxels = "--voxels --voxels.kinds groups --voxels.colours 8 --voxels.pictures cells"
+    cells = "--voxels.cell 0.25 --voxels.side 40"
+    assert program.main([*collect.split(), *voxels.split(), *cells.split()]) == 0
+    what = ("grown", "edit")
+    settings = persist_pictures.Settings("persist", what=what, data=data, out=tmp_path, steps=1)
+    persist_pictures.main(settings)
+    grown = cv2.imread(str(tmp_path / "grown.png"))
+    assert grown.std() > 0
+    sys.modules.pop("persist_pictures")

@@ -173,6 +173,10 @@ class PersistModel(AssembledModel):
     observation_logit: float = 0.0
     """Nats that a real image of blocks (`memory.pictures cells`) adds to the class that it shows in
     a cell: air before the measured depth, a surface at it; 0 as published."""
+    body_m: float = 0.0
+    """Radius of the agent's body, metres: the cells that it stands in, from shin to eyes, are empty
+    and count as observed, unless an image has shown a surface in them. So an agent that walks
+    through a guess corrects it. 0 for no body, as published."""
     sampled: Literal["always", "new"] = "always"
     """Imagined frames of which the voxels are sampled: `always`, as published, or those with `new`
     cells in the window; in the others nothing has changed that a guess could be revised by."""
@@ -243,6 +247,7 @@ class PersistModel(AssembledModel):
             )
         logits = ("persistence_logit", "empty_prior", "observation_logit")
         require_fields(self, "model", lambda value: value >= 0, "0 or more nats", *logits)
+        require(self.body_m >= 0, f"model.body_m is {self.body_m}: use 0 or more metres.")
         optional = ("shown_logit", "guess_logit")
         hint = "0 or more nats, or -1"
         require_fields(self, "model", lambda value: value >= 0 or value == -1, hint, *optional)

@@ -143,11 +143,13 @@ def marked(
     classes_XYZ: Array,
     evidence: ObservedCells | None,
     camera: Camera | None = None,
+    stood_XYZ: Array | None = None,
 ) -> Array | None:
     """Return a world's mask after a frame: what was observed stays observed.
 
-    ``evidence`` is that of a real frame. An imagined frame, of ``camera``, marks the cells of the
-    window that it shows, if guesses that were shown count otherwise than those that were not.
+    ``stood_XYZ`` are the cells of the window that the agent stands in. ``evidence`` is that of a
+    real frame. An imagined frame, of ``camera``, marks the cells of the window that it shows, if
+    guesses that were shown count otherwise than those that were not.
     """
     if grid.mask_XYZ is None:
         return None
@@ -161,7 +163,34 @@ def marked(
         corner = grid.low_3 + start_3 * model.cell
         seen = shown_cells(model, classes_XYZ, corner, jax.lax.stop_gradient(camera))
         mask = jnp.where(seen, jnp.maximum(mask, jnp.uint8(SHOWN)), mask)
+    if stood_XYZ is not None:
+        mask = jnp.where(stood_XYZ, jnp.uint8(OBSERVED), mask)
     return grid_state.write_window(grid.mask_XYZ, mask, start_3)
+
+
+def stood_in(
+    model: PersistModel,
+    grid: ClassGrid,
+    start_3: Array,
+    classes_XYZ: Array,
+    camera: Camera,
+    evidence: ObservedCells | None,
+) -> Array | None:
+    """Return (X, Y, Z) bool: the cells that the agent's body shows to be empty; None without one.
+
+    ``classes_XYZ`` are the cells of the window at ``start_3``. Surfaces that an image has shown,
+    now or before, stay.
+    """
+    if not model.body_m:
+        return None
+    eye = jax.lax.stop_gradient(camera).world_from_camera[:3, 3]
+    surface = jnp.zeros(classes_XYZ.shape, bool)
+    mask = _mask_window(model, grid, start_3)
+    if mask is not None:
+        surface = (mask == OBSERVED) & (classes_XYZ > EMPTY)
+    if evidence is not None:
+        surface = surface | (evidence.colour_XYZ >= 0)
+    return voxel_frames.body_cells(model, grid.low_3 + start_3 * model.cell, eye) & ~surface
 
 
 Render = Callable[[Array, Array], tuple[Array, FrameCache]]
@@ -236,8 +265,10 @@ def begin(
         model, params, history, history.voxels, middle, before, voxel_key, evidence, mask
     )
     classes = jnp.where(before >= 0, before, made)  # a known grid is not changed by its picture
+    stood = stood_in(model, grid, start, classes, camera, evidence)
+    classes = classes if stood is None else jnp.where(stood, EMPTY, classes)
     everything = grid_state.write_window(grid.classes_XYZ, classes, start)
-    everywhere = marked(model, grid, start, classes, evidence)
+    everywhere = marked(model, grid, start, classes, evidence, stood_XYZ=stood)
     seen = features(model, params, classes, grid.low_3, start, camera)
     render = renderer(model, params, seen, history.action_A, history.pictures)
     pictures = add_picture(model, render, latents, picture_key)
@@ -322,7 +353,13 @@ def step(
         model, params, everything, grid.low_3, here, action_A, history.cameras
     )
     camera = made if known.camera is None else camera
-    everywhere = marked(model, grid, start, classes, evidence, None if real else camera)
+    stood = None  # given cells stay
+    if known.classes_XYZ is None:
+        stood = stood_in(model, grid, start, classes, camera, evidence)
+    if stood is not None:
+        classes = jnp.where(stood, EMPTY, classes)
+        everything = grid_state.write_window(grid.classes_XYZ, classes, start)
+    everywhere = marked(model, grid, start, classes, evidence, None if real else camera, stood)
     seen = features(model, params, classes, grid.low_3, start, camera)
     render = renderer(model, params, seen, action_A, history.pictures)
     if known.rgb_HWC is None:

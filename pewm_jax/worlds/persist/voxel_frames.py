@@ -14,6 +14,7 @@ rendered from the voxels, so they are no evidence. Not as published.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -220,6 +221,10 @@ VOTES = 2
 """Pixels that must show a surface in a cell: a single one may be a ray that clips an edge."""
 NEAREST_M = 0.05
 """Cells nearer to the camera than this are not judged, metres."""
+SAMPLES = 4
+"""Points of a ray in a cell's width, by which the cells that it crosses are found."""
+SHIN_M = 0.35
+"""Height over the floor at which the agent's body begins, metres: rugs and sills lie below."""
 
 
 @jax.tree_util.register_dataclass
@@ -308,7 +313,46 @@ def _air_and_surface(
     side = model.side
     hits = jnp.zeros(side**3 + 1, jnp.int32).at[cell_P].add(1)[:-1]
     surface = (hits >= votes).reshape((side,) * 3)
-    return _cells_in_front(model, corner_3, depth_HW, camera) & ~surface, surface
+    empty = _cells_crossed if model.memory.pictures == "cells" else _cells_in_front
+    return empty(model, corner_3, depth_HW, camera) & ~surface, surface
+
+
+def _cells_crossed(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:
+    """Return the cells (X, Y, Z) that a pixel's ray crosses before its surface: a block is whole.
+
+    Rays are sampled four times in a cell's width, so that a clipped corner may be missed.
+    """
+    size, side = model.cell, model.side
+    eye = camera.world_from_camera[:3, 3]
+    way_HW3 = unproject(depth_HW, camera) - eye
+    metres_HW = jnp.linalg.norm(way_HW3, axis=-1)
+    farthest = side * size * math.sqrt(3)
+    steps = (np.arange(math.ceil(farthest / size * SAMPLES)) + 0.5) * size / SAMPLES
+
+    def cross(crossed: Array, metres: Array) -> tuple[Array, None]:
+        share_HW = metres / jnp.maximum(metres_HW, INTO_M)
+        at = jnp.floor((way_HW3 * share_HW[..., None] + (eye - corner_3)) / size).astype(jnp.int32)
+        before = (depth_HW > 0) & (metres > NEAREST_M) & (metres + INTO_M < metres_HW)
+        inside = before & ((at >= 0) & (at < side)).all(-1)
+        cell = jnp.where(inside, (at[..., 0] * side + at[..., 1]) * side + at[..., 2], side**3)
+        return crossed.at[cell.reshape(-1)].set(True), None
+
+    crossed, _ = jax.lax.scan(cross, jnp.zeros(side**3 + 1, bool), steps.astype(np.float32))
+    return crossed[:-1].reshape((side,) * 3)
+
+
+def body_cells(model: PersistModel, corner_3: Array, eye_3: Array) -> Array:
+    """Return (X, Y, Z) bool: the cells of a window that an agent with this camera stands in.
+
+    The body is a cylinder of radius ``model.body_m`` from ``SHIN_M`` above the floor to the eyes.
+    """
+    size, side = model.cell, model.side
+    low_S3 = corner_3 + np.arange(side)[:, None] * size
+    gap_S3 = jnp.abs(jnp.clip(eye_3, low_S3, low_S3 + size) - eye_3)
+    wide_XY = jnp.square(gap_S3[:, None, 0]) + jnp.square(gap_S3[None, :, 1]) <= model.body_m**2
+    floor = eye_3[2] - model.memory.eye_m
+    tall_Z = (low_S3[:, 2] + size > floor + SHIN_M) & (low_S3[:, 2] <= eye_3[2])
+    return wide_XY[..., None] & tall_Z
 
 
 def _cells_in_front(model: PersistModel, corner_3: Array, depth_HW: Array, camera: Camera) -> Array:

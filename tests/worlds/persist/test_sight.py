@@ -16,6 +16,7 @@ from pewm_jax.geometry.march import through_pixels
 from pewm_jax.memory import class_grid
 from pewm_jax.types import Camera
 from pewm_jax.worlds.persist import state as windows
+from pewm_jax.worlds.persist import step as persist_step
 from pewm_jax.worlds.persist import voxel_frames as persist_sight
 from pewm_jax.worlds.persist import voxel_frames as persist_voxels
 from pewm_jax.worlds.persist import world as persist
@@ -59,6 +60,49 @@ def test_a_picture_tells_air_from_surfaces_and_their_colours():
     # The cell of a block's face that is looked at, its colour, and the air beside it.
     assert colour[5, 2, 2] == 7
     assert air[4, 3, 3]
+
+
+def test_every_block_that_a_ray_crosses_is_empty():
+    grid, _, depth, camera = furnished()
+    sight = jax.jit(persist_sight.visible_cells, static_argnums=0)
+    air = np.asarray(sight(ROOM, LOW, depth, camera)[0])
+    memory = dataclasses.replace(MEMORY, pictures="surfaces")
+    surfaces = dataclasses.replace(ROOM, memory=memory, observation_logit=0.0)
+    front = np.asarray(sight(surfaces, LOW, depth, camera)[0])  # by the middles of cells alone
+    assert not grid[air].any()
+    assert air.sum() > 1.1 * front.sum()
+    assert (front & ~air).sum() < 0.02 * front.sum()
+
+
+def test_the_agent_stands_in_cells_around_it_from_shin_to_eyes():
+    model = dataclasses.replace(ROOM, body_m=0.2)
+    eye = np.array([0.1, 4.75, 0.3], np.float32)  # 0.1 m behind a border in x, in a middle in y
+    stood = np.asarray(persist_sight.body_cells(model, LOW, eye))
+    x, y, z = (set(axis.tolist()) for axis in np.nonzero(stood))
+    assert (x, y) == ({3, 4}, {4})
+    floor = eye[2] - model.memory.eye_m
+    heights = LOW[2] + CELL * np.arange(8)
+    between = (heights + CELL > floor + persist_sight.SHIN_M) & (heights <= eye[2])
+    assert z == set(np.flatnonzero(between).tolist())
+
+
+@pytest.mark.parametrize("known", [class_grid.GUESSED, class_grid.OBSERVED])
+def test_an_agent_corrects_a_guess_that_it_stands_in_but_no_surface_that_was_seen(known):
+    model = dataclasses.replace(ROOM, body_m=0.2)
+    cells = np.full((8, 8, 8), 3)
+    mask = np.full((8, 8, 8), known, np.uint8)
+    pose = pose_from_yaw(np.array([0.1, 4.75, 0.3]), 0.0).astype(np.float32)
+    camera = Camera(np.ones(4, np.float32), pose)
+    body = np.asarray(persist_sight.body_cells(model, LOW, pose[:3, 3]))
+    grid, start = class_grid.ClassGrid(cells, LOW, mask_XYZ=jnp.asarray(mask)), np.zeros(3, int)
+    stood = np.asarray(persist_step.stood_in(model, grid, start, cells, camera, None))
+    np.testing.assert_array_equal(stood, body & (known != class_grid.OBSERVED))
+    surface = np.where(np.arange(8)[:, None, None] == 3, 1, -1) * np.ones((8, 8, 8), int)
+    evidence = persist_sight.ObservedCells(surface < 0, surface)
+    fresh = class_grid.ClassGrid(cells, LOW, mask_XYZ=jnp.zeros((8, 8, 8), jnp.uint8))
+    stood = np.asarray(persist_step.stood_in(model, fresh, start, cells, camera, evidence))
+    np.testing.assert_array_equal(stood, body & (surface < 0))
+    assert persist_step.stood_in(ROOM, grid, start, cells, camera, None) is None
 
 
 @pytest.mark.slow
