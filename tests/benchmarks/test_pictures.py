@@ -59,7 +59,7 @@ def test_pictures_of_a_world_of_voxels_are_drawn(tmp_path, monkeypatch):
     import persist_pictures
 
     data = tmp_path / "data"
-    collect = f"data collect {data} --moving --train 0 --validation 0 --test 1 --frames 12"
+    collect = f"data collect {data} --moving --train 0 --validation 0 --test 1 --frames 27"
     voxels = "--voxels --voxels.kinds groups --voxels.colours 8 --voxels.pictures cells"
     cells = "--voxels.cell 0.25 --voxels.side 40"
     assert program.main([*collect.split(), *voxels.split(), *cells.split()]) == 0
