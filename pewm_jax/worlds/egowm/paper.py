@@ -92,29 +92,9 @@ def cosmos_experiment(
     Cosmos-Predict2's own training (0.9 and 0.99,
     ``cosmos_predict2/configs/base/defaults/optimizer.py``).
     """
-    frames, height, width = clip
-    return Config(
-        model=EgoWM(
-            clip=ClipConfig(frames=frames, height=height, width=width, depth=False),
-            codec=dataclasses.replace(vae, depth=False),
-            backbone=dataclasses.replace(transformer, remat=True),
-            control=ModulationConfig(projection="convolution"),
-            noise=dataclasses.replace(noise, log_mean=1.0, log_std=1.2),
-            dtype=dtype,
-        ),
-        data=DataConfig(path="data/egowm", context=1, stride_max=1),
-        train=EgoWMTrainConfig(
-            run=f"runs/{run}",
-            adapt=StageConfig(steps=20000, batch=8, learning_rate=1e-6, warmup=500),
-            mesh=MeshConfig(fsdp=8),
-            image_noise_mean=-10.0,
-            image_noise_std=0.0,
-            beta2=0.99,
-            ema=0.9999,
-            preview_every=0,
-        ),
-        evaluate=EvalConfig(batch=1),
-    )
+    noise = dataclasses.replace(noise, log_mean=1.0, log_std=1.2)
+    train = _adaptation(run, learning_rate=1e-6, beta2=0.99)
+    return _of_transformer(transformer, vae, noise, train, clip, dtype)
 
 
 def cogvideox_experiment(
@@ -135,6 +115,19 @@ def cogvideox_experiment(
     CogVideoX's own fine-tuning (0.9 and 0.95; CogVideo's ``sat/configs/sft.yaml``); steps, batch
     and learning rate are ours.
     """
+    train = _adaptation(run, learning_rate=1e-5, beta2=0.95)
+    return _of_transformer(transformer, vae, noise, train, clip, dtype)
+
+
+def _of_transformer(
+    transformer: CosmosBackbone | DiTBackbone,
+    vae: WanVAECodec | VAECodec,
+    noise: EDMConfig | DDPMConfig,
+    train: EgoWMTrainConfig,
+    clip: tuple[int, int, int],
+    dtype: Literal["float32", "bfloat16"],
+) -> Config:
+    """Return the settings around a transformer whose latents cover four frames each."""
     frames, height, width = clip
     return Config(
         model=EgoWM(
@@ -146,15 +139,20 @@ def cogvideox_experiment(
             dtype=dtype,
         ),
         data=DataConfig(path="data/egowm", context=1, stride_max=1),
-        train=EgoWMTrainConfig(
-            run=f"runs/{run}",
-            adapt=StageConfig(steps=20000, batch=8, learning_rate=1e-5, warmup=500),
-            mesh=MeshConfig(fsdp=8),
-            image_noise_mean=-10.0,
-            image_noise_std=0.0,
-            beta2=0.95,
-            ema=0.9999,
-            preview_every=0,
-        ),
+        train=train,
         evaluate=EvalConfig(batch=1),
+    )
+
+
+def _adaptation(run: str, *, learning_rate: float, beta2: float) -> EgoWMTrainConfig:
+    """Return the settings of training such a transformer, without noise on the observed frame."""
+    return EgoWMTrainConfig(
+        run=f"runs/{run}",
+        adapt=StageConfig(steps=20000, batch=8, learning_rate=learning_rate, warmup=500),
+        mesh=MeshConfig(fsdp=8),
+        image_noise_mean=-10.0,
+        image_noise_std=0.0,
+        beta2=beta2,
+        ema=0.9999,
+        preview_every=0,
     )
