@@ -226,10 +226,16 @@ def edits(settings: Settings, model, params, episodes, imagine) -> None:
         pictures = [x[: x.shape[0] // 2 * 2, : x.shape[1] // 2 * 2] for x in small_frames(films)]
         with atomic.replacing(settings.out / f"edit_{kind}.mp4") as partial:
             partial.write_bytes(encode_h264(pictures, 6))
-        shown = np.linspace(0, len(truth), 8).round().astype(int)
+        shown = _shown_frames(plan.changed_T)
         rows = [(name, [film[t] for t in shown]) for name, film in films]
         _save(settings.out / f"edit_{kind}.png", rows, [f"{t}" for t in shown])
         print(f"{kind}: {episode.name}, frames {plan.start} to {plan.end}, {plan.about}")
+
+
+def _shown_frames(changed_T: np.ndarray) -> list[int]:
+    """Return the first frame and seven, evenly spaced, from which the edit is seen to the last."""
+    seen = int(np.flatnonzero(changed_T >= changed_T.max() / 4)[0])
+    return [0, *np.linspace(seen, len(changed_T), 7).round().astype(int).tolist()]
 
 
 def _given(episode: Episode, frame: int):

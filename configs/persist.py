@@ -57,7 +57,7 @@ def config() -> Config:
         shifted_times=True,
         sample_steps=8,
         shift=3.0,
-        temperature=0.4,
+        temperature=0.1,
     )
     backbone = dataclasses.replace(
         nets, voxel_vae=vae, world_frames=frames, renderer=renderer, camera_model=camera
@@ -75,6 +75,7 @@ def config() -> Config:
             shown_logit=8.0,
             guess_logit=2.0,
             body_m=0.2,
+            moving=("door", "robot"),
             sampled="new",
         ),
         data=dataclasses.replace(

@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 
 from pewm_jax.data.episodes import Episode
+from pewm_jax.data.render import draw_blocks
+from pewm_jax.data.voxels import VoxelFrames
 from pewm_jax.eval.voxel_scores import house_of
 from pewm_jax.houses.floorplan import DOOR_TOP_M
 from pewm_jax.houses.generate import object_boxes
@@ -41,6 +43,8 @@ BESIDE_M = 0.12
 """Distance around a chair that is emptied with it, metres."""
 AGREES_M = 0.45
 """Largest difference between the place's depth and that measured in its direction."""
+CHANGED_SHARE = {"wall": 0.3, "door": 0.15, "chair": 0.08}
+"""Least share of an image's pixels that an edit changes in a frame drawn from the recorded grid."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +57,8 @@ class Plan:
         end: last frame of the walk.
         box_23: the box that is emptied or moved, metres.
         move: rigid (4, 4) by which its content moves; None if it is removed.
+        changed_T: share of the pixels that the edit changes in each frame after ``start``, drawn
+            from the recorded grid; empty if it was not computed.
     """
 
     about: str
@@ -60,6 +66,7 @@ class Plan:
     end: int
     box_23: np.ndarray
     move: np.ndarray | None = None
+    changed_T: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,10 +82,16 @@ class _Place:
 
 def apply(model: Any, state: WorldState, plan: Plan) -> WorldState:
     """Return a world with the edit."""
+    change, *arguments = _change(plan)
+    return persist.edit(state, change, model.memory, *arguments)
+
+
+def _change(plan: Plan) -> tuple[Any, ...]:
+    """Return the function of ``class_grid`` that makes an edit, and the arguments after a grid."""
     box = plan.box_23.astype(np.float32)
     if plan.move is None:
-        return persist.edit(state, class_grid.erase, model.memory, box)
-    return persist.edit(state, class_grid.move, model.memory, box, plan.move.astype(np.float32))
+        return class_grid.erase, box
+    return class_grid.move, box, plan.move.astype(np.float32)
 
 
 def first_plan(
@@ -120,8 +133,32 @@ def plan(model: Any, episode: Episode, kind: str, *, beside: bool = False) -> Pl
             continue
         if kind == "door" and not _is_closed(episode, start, place.box_23):
             continue
-        return Plan(place.about, start, end, place.box_23, place.move)
+        made = Plan(place.about, start, end, place.box_23, place.move)
+        changed = _changed(model, episode, made)
+        if changed.max(initial=0) >= CHANGED_SHARE[kind]:
+            return dataclasses.replace(made, changed_T=changed)
     return None
+
+
+def _changed(model: Any, episode: Episode, plan: Plan) -> np.ndarray:
+    """Return the share of the pixels that an edit changes in each frame of its walk, (T,)."""
+    recorded = episode.voxels([plan.start])
+    grid = class_grid.ClassGrid(recorded.classes_TXYZ[0].astype(np.int16), recorded.origin_T3[0])
+    change, *arguments = _change(plan)
+    edited = change(model.memory, grid, *arguments)
+    frames = range(plan.start + 1, plan.end + 1)
+
+    def drawn(classes_XYZ: Any) -> np.ndarray:
+        cells = VoxelFrames(
+            np.broadcast_to(np.asarray(classes_XYZ), (len(frames), *classes_XYZ.shape)),
+            np.broadcast_to(recorded.origin_T3, (len(frames), 3)),
+            recorded.cell_m,
+            recorded.names,
+        )
+        return draw_blocks(cells, episode.camera(frames), episode.height, episode.width).depth_THW
+
+    off = np.abs(drawn(grid.classes_XYZ) - drawn(edited.classes_XYZ))
+    return (off > model.cell / 2).mean((1, 2))
 
 
 def _room_at(house: Mapping[str, Any], xy: np.ndarray) -> int:

@@ -28,7 +28,7 @@ from pewm_jax.types import Params
 
 UNSEEN, KNOWN, LONG, BESIDE = "unseen", "known", "long", "beside"
 """Pieces of work."""
-VERSION = 3
+VERSION = 4
 """Increase it whenever a score is measured in another way: older pieces are not reused then."""
 STRETCHES = 3
 """Parts of equal length of a long walk, over which PSNR is averaged."""

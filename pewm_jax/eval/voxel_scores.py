@@ -54,6 +54,7 @@ MECHANISMS: dict[str, dict[str, Any]] = {
     "observation_logit": {"observation_logit": 0.0},
     "guesses": {"shown_logit": -1.0, "guess_logit": -1.0},
     "body": {"body_m": 0.0},
+    "moving": {"moving": ()},
     "sampled": {"sampled": "always"},
     "sample_steps": {"voxel_noise": {"sample_steps": 1}},
 }
@@ -77,7 +78,7 @@ fill the lowest cells."""
 ACROSS_M = 0.25
 """Distance before and behind a doorway that must be free, too, metres."""
 SEEN_SHARE = 0.5
-"""Share of the cells of a way through a doorway that observed frames must show empty."""
+"""Share of each lane of a way through a doorway that observed frames must show empty."""
 
 
 def variant(config: Config, mechanism: str) -> Config:
@@ -392,21 +393,29 @@ def cells_at(grid: ClassGrid, cell_m: float, points: np.ndarray) -> np.ndarray:
 
 def passable(config: Config, grid: ClassGrid, way: np.ndarray) -> bool:
     """Return whether ``LANE`` lanes side by side are empty in a grid; unknown cells are not."""
-    free = (cells_at(grid, config.model.cell, way) == class_grid.EMPTY).all(1)
-    return bool(np.convolve(free, np.ones(LANE, int), "valid").max(initial=0) >= LANE)
+    return _wide((cells_at(grid, config.model.cell, way) == class_grid.EMPTY).all(1))
+
+
+def _wide(free_L: np.ndarray) -> bool:
+    """Return whether ``LANE`` lanes side by side are free."""
+    return bool(np.convolve(free_L, np.ones(LANE, int), "valid").max(initial=0) >= LANE)
 
 
 def open_doorways(config: Config, episode: Episode, at: int, context: int) -> list[np.ndarray]:
     """Return the ways through the true doorways that the frames before a walk show open.
 
     A doorway counts if it lies in the world's window at the present frame, ``at``, the recorded
-    grid lets one pass, and the observed frames show at least half of the way empty.
+    grid lets one pass by some lanes, and the observed frames show at least half of each of these
+    lanes empty. Frames before its door last moved show nothing of that.
     """
     house, model = house_of(episode.scene), config.model
     if house is None:
         return []
-    recorded = episode.voxels([at])
-    grid = ClassGrid(recorded.classes_TXYZ[0].astype(np.int16), recorded.origin_T3[0])
+    grids = [
+        ClassGrid(classes.astype(np.int16), low)
+        for recorded in [episode.voxels(range(at + 1 - context, at + 1))]
+        for classes, low in zip(recorded.classes_TXYZ, recorded.origin_T3, strict=True)
+    ]
     seen = _observed(episode, at, context)
     floor = float(episode.world_from_camera[at][2, 3]) - model.memory.eye_m
     low, first = _window_at(model, seen)
@@ -414,11 +423,16 @@ def open_doorways(config: Config, episode: Episode, at: int, context: int) -> li
     found = []
     for *_, x0, y0, x1, y1 in house["doorways"]:
         way = way_through((x0, y0, x1, y1), floor, model.cell)
-        known = cells_at(grid, model.cell, way) != UNKNOWN
-        known &= ((way >= corner) & (way < corner + model.side * model.cell)).all(-1)
-        if known.all() and passable(config, grid, way):
-            shown = _points_shown(seen, way)
-            if shown.mean() >= SEEN_SHARE:
+        cells = cells_at(grids[-1], model.cell, way)
+        known = (cells != UNKNOWN) & (
+            (way >= corner) & (way < corner + model.side * model.cell)
+        ).all(-1)
+        if known.all() and passable(config, grids[-1], way):
+            same = [(cells_at(grid, model.cell, way) == cells).all() for grid in grids]
+            since = context - int(np.argmin([*same[::-1], False]))
+            shown = _points_shown(jax.tree.map(lambda x, k=since: x[k:], seen), way)
+            free = (cells == class_grid.EMPTY).all(1)
+            if _wide(free & (shown.mean(1) >= SEEN_SHARE)):
                 found.append(way)
     return found
 

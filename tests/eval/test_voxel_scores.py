@@ -216,6 +216,40 @@ def test_points_count_as_shown_in_front_of_the_depth():
     np.testing.assert_array_equal(voxel_scores._points_shown(seen, points), [True, False, False])
 
 
+@pytest.mark.parametrize(
+    ("closed", "shown", "count"),
+    [(4, range(4), 0), (4, range(8), 1), (4, [7], 1), (0, [0], 1), (8, range(8), 0)],
+)
+def test_a_doorway_that_was_closed_when_it_was_last_seen_was_not_seen_open(
+    monkeypatch, closed, shown, count
+):
+    """The door is closed in the first frames, and the images show what is there in some."""
+    house = {"doorways": [(0, 1, 5.0, 2.5, 5.1, 3.5)]}
+    monkeypatch.setattr(voxel_scores, "house_of", lambda scene: house)
+    classes = np.zeros((8, 40, 40, 40), np.uint16)
+    classes[:closed, 28, 18:22, 16:25] = 3
+
+    def see(indices):
+        depth = np.full((8, 16, 16), 0.5, np.float32)
+        depth[list(shown)] = 6.0
+        camera = Camera(np.tile(np.float32([8] * 4), (8, 1)), np.stack([pose(3, 3, 0.0)] * 8))
+        return jax.tree.map(
+            lambda x: x[list(indices)], Frames(np.zeros((8, 16, 16, 3), np.float32), depth, camera)
+        )
+
+    episode = SimpleNamespace(
+        scene="house-0",
+        world_from_camera=np.stack([pose(3, 3, 0.0)] * 8),
+        frames=see,
+        voxels=lambda indices: SimpleNamespace(
+            classes_TXYZ=classes[list(indices)],
+            origin_T3=np.tile(np.float32([-2, -2, -4]), (len(indices), 1)),
+        ),
+    )
+    config = presets.load("persist")
+    assert len(voxel_scores.open_doorways(config, episode, 7, 8)) == count
+
+
 def test_long_walks_compare_what_is_seen_again_at_their_start_and_end(monkeypatch):
     """A world that forgets: after the walk its frames are darker, and a doorway is walled up."""
     way = voxel_scores.way_through((2.0, 2.0, 2.12, 4.0), 0.0, 0.5)
@@ -247,13 +281,16 @@ def test_long_walks_compare_what_is_seen_again_at_their_start_and_end(monkeypatc
 
 
 def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
-    config = CONFIG.with_model(empty_prior=2.0, guess_logit=1.0, shown_logit=2.0, body_m=0.2)
+    config = CONFIG.with_model(
+        empty_prior=2.0, guess_logit=1.0, shown_logit=2.0, body_m=0.2, moving=("door",)
+    )
     rows = {name: voxel_scores.variant(config, name).model for name in voxel_scores.MECHANISMS}
     assert rows["as trained"] == config.model
     assert rows["persistence_logit"].kept_logits == (0, 0, 0)
     assert rows["empty_prior"].empty_prior == 0
     assert rows["observation_logit"].observation_logit == 0
     assert rows["body"].body_m == 0
+    assert rows["moving"].moving == ()
     hold = config.model.persistence_logit
     assert rows["guesses"].kept_logits == (hold, hold, hold)
     assert [rows[name].sampled for name in ("persistence_logit", "sampled")] == ["always"] * 2
@@ -393,6 +430,7 @@ class Corridor:
 def test_a_door_is_opened_from_a_third_room_if_any_walk_leads_from_one(monkeypatch):
     monkeypatch.setattr(voxel_edits, "house_of", lambda scene: Corridor.house)
     monkeypatch.setattr(voxel_edits, "_is_closed", lambda *arguments: True)
+    monkeypatch.setattr(voxel_edits, "_changed", lambda *arguments: np.ones(1))
     third = Corridor(np.arange(0.5, 5.0, 0.5), np.zeros(9))
     found = voxel_edits.plan(MASKED, third, "door")
     assert found is not None
@@ -414,6 +452,22 @@ def test_a_door_is_opened_from_a_third_room_if_any_walk_leads_from_one(monkeypat
     assert first([beside], "door") == (None, None)
     # The wall of the next room is not seen from behind, which is a wall of the agent's own room.
     assert voxel_edits.plan(MASKED, beside, "wall") is None
+
+
+def test_an_edit_is_shown_where_it_changes_the_image(episode):
+    recorded = episode.voxels([0])
+    pose = np.asarray(episode.camera(range(1, 4)).world_from_camera)[:, :3, 3]
+    # A block of what surrounds the agent changes most of the image, a distant cell nothing.
+    around = np.stack([pose.min(0) - 2.5, pose.max(0) + 2.5])
+    nothing = np.stack([pose.min(0) + 100, pose.min(0) + 101])
+    assert (recorded.classes_TXYZ > 0).any()
+    shares = [
+        voxel_edits._changed(MASKED, episode, voxel_edits.Plan("x", 0, 3, box))
+        for box in (around, nothing)
+    ]
+    assert [len(one) for one in shares] == [3, 3]
+    assert shares[0].max() > 0.3
+    assert not shares[1].any()
 
 
 def test_an_edit_changes_the_box_alone():

@@ -18,6 +18,7 @@ from pewm_jax.config import (
     TrainSettings,
 )
 from pewm_jax.errors import require, require_fields
+from pewm_jax.memory import class_grid
 from pewm_jax.memory.class_grid import GridConfig
 from pewm_jax.models.persist.nets import PersistNetsConfig
 from pewm_jax.registry import part
@@ -177,6 +178,10 @@ class PersistModel(AssembledModel):
     """Radius of the agent's body, metres: the cells that it stands in, from shin to eyes, are empty
     and count as observed, unless an image has shown a surface in them. So an agent that walks
     through a guess corrects it. 0 for no body, as published."""
+    moving: tuple[str, ...] = ()
+    """Kinds of things that move, such as `door` and `robot`: if a real image shows an observed cell
+    of theirs empty, the cells of these kinds that are connected with it are unknown again. Not as
+    published."""
     sampled: Literal["always", "new"] = "always"
     """Imagined frames of which the voxels are sampled: `always`, as published, or those with `new`
     cells in the window; in the others nothing has changed that a guess could be revised by."""
@@ -248,6 +253,12 @@ class PersistModel(AssembledModel):
         logits = ("persistence_logit", "empty_prior", "observation_logit")
         require_fields(self, "model", lambda value: value >= 0, "0 or more nats", *logits)
         require(self.body_m >= 0, f"model.body_m is {self.body_m}: use 0 or more metres.")
+        known = sorted({name.partition("/")[0] for name in class_grid.names(self.memory)[1:]})
+        for kind in self.moving:
+            require(
+                kind in known,
+                f"model.moving names {kind!r}, and the kinds of this world are {', '.join(known)}.",
+            )
         optional = ("shown_logit", "guess_logit")
         hint = "0 or more nats, or -1"
         require_fields(self, "model", lambda value: value >= 0 or value == -1, hint, *optional)

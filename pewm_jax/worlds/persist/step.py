@@ -326,16 +326,15 @@ def step(
     start = known.start_3
     if start is None:
         start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
+    classes, real = known.classes_XYZ, known.rgb_HWC is not None
+    evidence, grid = _looked(model, grid, start, known, camera)
     middle = grid_state.middle(model, grid.low_3, start)
     before = grid_state.window(model, grid.classes_XYZ, start)
     cache = grid_state.move_cache(model, history.voxels, history.start_3, start)
     mask = _mask_window(model, grid, start)
     cache = voxel_frames.add_present(model, params, history, cache, middle, before, keys[0], mask)
     now = dataclasses.replace(history, action_A=action_A, shown=past.shown)
-    classes, evidence, real = known.classes_XYZ, None, known.rgb_HWC is not None
     if classes is None:
-        if known.rgb_HWC is not None and known.depth_HW is not None:
-            evidence = _evidence(model, grid, start, known.rgb_HWC, known.depth_HW, camera)
 
         def sampled() -> Array:
             key = keys[1]
@@ -383,6 +382,16 @@ def step(
 def _mask_window(model: PersistModel, grid: ClassGrid, start_3: Array) -> Array | None:
     """Return the mask of a window's cells, if the world keeps one."""
     return None if grid.mask_XYZ is None else grid_state.window(model, grid.mask_XYZ, start_3)
+
+
+def _looked(
+    model: PersistModel, grid: ClassGrid, start_3: Array, known: KnownFrame, camera: Camera
+) -> tuple[ObservedCells | None, ClassGrid]:
+    """Return the evidence of a known frame, and a grid without what it shows to have moved."""
+    if known.classes_XYZ is not None or known.rgb_HWC is None or known.depth_HW is None:
+        return None, grid
+    found = _evidence(model, grid, start_3, known.rgb_HWC, known.depth_HW, camera)
+    return found, grid if found is None else voxel_frames.forget_moved(model, grid, start_3, found)
 
 
 def _evidence(

@@ -25,7 +25,8 @@ from pewm_jax.data.voxels import PALETTE
 from pewm_jax.geometry import march
 from pewm_jax.geometry.actions import camera_numbers
 from pewm_jax.geometry.cameras import invert_rigid, transform_points, unproject
-from pewm_jax.memory.class_grid import EMPTY, GUESSED, OBSERVED, UNKNOWN
+from pewm_jax.memory import class_grid
+from pewm_jax.memory.class_grid import EMPTY, GUESSED, OBSERVED, UNKNOWN, ClassGrid
 from pewm_jax.models.persist import voxel_dit, voxel_vae
 from pewm_jax.models.persist.blocks import FrameCache
 from pewm_jax.nn.layers import linear
@@ -213,6 +214,40 @@ def _condition(model: PersistModel, history: History, middle_3: Array) -> dict[s
         "pixels_BThwC": channels[None, None],
         "camera_BTN": camera[None, None] if config.camera_numbers else None,
     }
+
+
+MOVED_M = 2.5
+"""Reach of what has moved, metres, from the cell that is seen to be empty: a door's height."""
+
+
+def forget_moved(
+    model: PersistModel, grid: ClassGrid, start_3: Array, evidence: ObservedCells
+) -> ClassGrid:
+    """Return a grid without what a real image shows to have moved; see ``model.moving``.
+
+    Surfaces that the image shows stay. ``evidence`` is that of the window at ``start_3``.
+    """
+    if not model.moving or grid.mask_XYZ is None:
+        return grid
+    kinds = [name.partition("/")[0] in model.moving for name in class_grid.names(model.memory)]
+    classes = grid_state.window(model, grid.classes_XYZ, start_3)
+    mask = grid_state.window(model, grid.mask_XYZ, start_3)
+    movable = jnp.asarray(kinds)[jnp.maximum(classes, 0)] & (classes > EMPTY) & (mask == OBSERVED)
+
+    def spread(_: int, found: Array) -> Array:
+        near = jax.lax.reduce_window(found, False, jax.lax.bitwise_or, (3,) * 3, (1,) * 3, "SAME")
+        return near & movable
+
+    steps = math.ceil(MOVED_M / model.cell)
+    gone = jax.lax.fori_loop(0, steps, spread, movable & evidence.air_XYZ)
+    gone = gone & (evidence.colour_XYZ < 0)
+    classes = jnp.where(gone, jnp.asarray(UNKNOWN, classes.dtype), classes)
+    mask = jnp.where(gone, jnp.uint8(GUESSED), mask)
+    return dataclasses.replace(
+        grid,
+        classes_XYZ=grid_state.write_window(grid.classes_XYZ, classes, start_3),
+        mask_XYZ=grid_state.write_window(grid.mask_XYZ, mask, start_3),
+    )
 
 
 INTO_M = 0.005

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax import worlds
+from pewm_jax.config import UserError
 from pewm_jax.data import render
 from pewm_jax.data.voxels import VoxelFrames, table_colours
 from pewm_jax.geometry import march
@@ -103,6 +104,45 @@ def test_an_agent_corrects_a_guess_that_it_stands_in_but_no_surface_that_was_see
     stood = np.asarray(persist_step.stood_in(model, fresh, start, cells, camera, evidence))
     np.testing.assert_array_equal(stood, body & (surface < 0))
     assert persist_step.stood_in(ROOM, grid, start, cells, camera, None) is None
+
+
+def test_a_door_of_which_a_part_has_gone_is_unknown_until_it_is_seen_again():
+    model = dataclasses.replace(ROOM, moving=("door",))
+    doors = [class_grid.number_of(MEMORY, f"door/{colour}") for colour in ("red", "white")]
+    cells = np.full((8, 8, 8), class_grid.number_of(MEMORY, "wall/red"))
+    mask = np.full((8, 8, 8), class_grid.OBSERVED, np.uint8)
+    cells[2:6, 3, 1:5], cells[2:6, 4, 5] = doors  # one leaf, of two colours, over a corner
+    cells[2:6, 3, 7] = doors[0]  # another door
+    mask[2, 3, 1:5] = class_grid.GUESSED
+    colour = np.full((8, 8, 8), -1)
+    colour[5, 3, 1] = 0  # seen where it was
+    gone = np.zeros((8, 8, 8), bool)
+    gone[3, 3, 2] = True
+    grid = class_grid.ClassGrid(jnp.asarray(cells), LOW, mask_XYZ=jnp.asarray(mask))
+    start = np.zeros(3, int)
+
+    def forgotten(model, air):
+        evidence = persist_sight.ObservedCells(jnp.asarray(air), jnp.asarray(colour))
+        made = persist_sight.forget_moved(model, grid, start, evidence)
+        lost = np.asarray(made.classes_XYZ) == class_grid.UNKNOWN
+        np.testing.assert_array_equal(np.asarray(made.classes_XYZ)[~lost], cells[~lost])
+        expected = np.where(lost, class_grid.GUESSED, mask)
+        np.testing.assert_array_equal(np.asarray(made.mask_XYZ), expected)
+        return lost
+
+    leaf = np.zeros((8, 8, 8), bool)
+    leaf[3:6, 3, 1:5] = leaf[2:6, 4, 5] = True
+    leaf[5, 3, 1] = False
+    np.testing.assert_array_equal(forgotten(model, gone), leaf)
+    wall = np.zeros((8, 8, 8), bool)
+    wall[0] = True  # what vanishes is no door
+    for other, air in ((ROOM, gone), (model, wall), (model, np.zeros_like(gone))):
+        assert not forgotten(other, air).any()
+
+
+def test_kinds_that_move_are_kinds_of_the_world():
+    with pytest.raises(UserError, match=r"model.moving names 'wolf', and the kinds .* door"):
+        dataclasses.replace(ROOM, moving=("door", "wolf"))
 
 
 @pytest.mark.slow
