@@ -233,9 +233,8 @@ def edits(settings: Settings, model, params, episodes, imagine) -> None:
 
 
 def _shown_frames(changed_T: np.ndarray) -> list[int]:
-    """Return the first frame and seven, evenly spaced, from which the edit is seen to the last."""
-    seen = int(np.flatnonzero(changed_T >= changed_T.max() / 4)[0])
-    return [0, *np.linspace(seen, len(changed_T), 7).round().astype(int).tolist()]
+    """Return the first frame, and the seven in which the edit changes most pixels."""
+    return [0, *sorted((np.argsort(-changed_T, kind="stable")[:7] + 1).tolist())]
 
 
 def _given(episode: Episode, frame: int):

@@ -44,7 +44,12 @@ BESIDE_M = 0.12
 AGREES_M = 0.45
 """Largest difference between the place's depth and that measured in its direction."""
 CHANGED_SHARE = {"wall": 0.3, "door": 0.15, "chair": 0.08}
-"""Least share of an image's pixels that an edit changes in a frame drawn from the recorded grid."""
+"""Least share of an image's pixels that an edit changes in some frames drawn from the recorded
+grid."""
+CHANGED_LEVELS = 30
+"""Levels of 255 by which a colour must differ."""
+CHANGED_FRAMES = 4
+"""Number of these frames."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +140,7 @@ def plan(model: Any, episode: Episode, kind: str, *, beside: bool = False) -> Pl
             continue
         made = Plan(place.about, start, end, place.box_23, place.move)
         changed = _changed(model, episode, made)
-        if changed.max(initial=0) >= CHANGED_SHARE[kind]:
+        if (changed >= CHANGED_SHARE[kind]).sum() >= CHANGED_FRAMES:
             return dataclasses.replace(made, changed_T=changed)
     return None
 
@@ -155,10 +160,11 @@ def _changed(model: Any, episode: Episode, plan: Plan) -> np.ndarray:
             recorded.cell_m,
             recorded.names,
         )
-        return draw_blocks(cells, episode.camera(frames), episode.height, episode.width).depth_THW
+        seen = draw_blocks(cells, episode.camera(frames), episode.height, episode.width)
+        return seen.rgb_THWC.astype(int)
 
-    off = np.abs(drawn(grid.classes_XYZ) - drawn(edited.classes_XYZ))
-    return (off > model.cell / 2).mean((1, 2))
+    off = np.abs(drawn(grid.classes_XYZ) - drawn(edited.classes_XYZ)).max(-1)
+    return (off > CHANGED_LEVELS).mean((1, 2))
 
 
 def _room_at(house: Mapping[str, Any], xy: np.ndarray) -> int:

@@ -165,7 +165,7 @@ def test_the_commands_of_the_readme_and_its_example_work_as_written(folder):
     assert len([line for line in example.splitlines() if line.strip()]) <= 15
     out = run([sys.executable, "-c", example], folder)
     assert out.startswith("(8, 64, 64, 3) (8, 64, 64)\n")
-    assert "cells remembered" in out
+    assert "occupied cells" in out
 
 
 @pytest.mark.slow

@@ -430,7 +430,7 @@ class Corridor:
 def test_a_door_is_opened_from_a_third_room_if_any_walk_leads_from_one(monkeypatch):
     monkeypatch.setattr(voxel_edits, "house_of", lambda scene: Corridor.house)
     monkeypatch.setattr(voxel_edits, "_is_closed", lambda *arguments: True)
-    monkeypatch.setattr(voxel_edits, "_changed", lambda *arguments: np.ones(1))
+    monkeypatch.setattr(voxel_edits, "_changed", lambda *arguments: np.ones(4))
     third = Corridor(np.arange(0.5, 5.0, 0.5), np.zeros(9))
     found = voxel_edits.plan(MASKED, third, "door")
     assert found is not None
