@@ -76,6 +76,7 @@ def config() -> Config:
             guess_logit=2.0,
             body_m=0.2,
             moving=("door", "robot"),
+            colour_reach_m=0.75,
             sampled="new",
         ),
         data=dataclasses.replace(

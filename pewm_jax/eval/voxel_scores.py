@@ -55,6 +55,7 @@ MECHANISMS: dict[str, dict[str, Any]] = {
     "guesses": {"shown_logit": -1.0, "guess_logit": -1.0},
     "body": {"body_m": 0.0},
     "moving": {"moving": ()},
+    "colour_reach_m": {"colour_reach_m": 0.0},
     "sampled": {"sampled": "always"},
     "sample_steps": {"voxel_noise": {"sample_steps": 1}},
 }

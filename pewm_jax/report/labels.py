@@ -313,6 +313,7 @@ VOXEL_ROWS = {
     "observation_logit": "observation_logit 0",
     "guesses": "guesses are not revised",
     "body": "the cells that the agent stands in stay as imagined",
+    "colour_reach_m": "colours are guessed for each cell alone",
     "moving": "doors and robots that have moved stay where they were seen",
     "sampled": "voxels are sampled in every frame",
     "sample_steps": "voxels are sampled in one step",

@@ -282,7 +282,12 @@ def test_long_walks_compare_what_is_seen_again_at_their_start_and_end(monkeypatc
 
 def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
     config = CONFIG.with_model(
-        empty_prior=2.0, guess_logit=1.0, shown_logit=2.0, body_m=0.2, moving=("door",)
+        empty_prior=2.0,
+        guess_logit=1.0,
+        shown_logit=2.0,
+        body_m=0.2,
+        moving=("door",),
+        colour_reach_m=1.0,
     )
     rows = {name: voxel_scores.variant(config, name).model for name in voxel_scores.MECHANISMS}
     assert rows["as trained"] == config.model
@@ -291,6 +296,7 @@ def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
     assert rows["observation_logit"].observation_logit == 0
     assert rows["body"].body_m == 0
     assert rows["moving"].moving == ()
+    assert rows["colour_reach_m"].colour_reach_m == 0
     hold = config.model.persistence_logit
     assert rows["guesses"].kept_logits == (hold, hold, hold)
     assert [rows[name].sampled for name in ("persistence_logit", "sampled")] == ["always"] * 2

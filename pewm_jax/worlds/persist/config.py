@@ -178,6 +178,10 @@ class PersistModel(AssembledModel):
     """Radius of the agent's body, metres: the cells that it stands in, from shin to eyes, are empty
     and count as observed, unless an image has shown a surface in them. So an agent that walks
     through a guess corrects it. 0 for no body, as published."""
+    colour_reach_m: float = 0.0
+    """Distance, metres, within which cells of the same kind agree on the colour of a cell that is
+    guessed: the colour that is likeliest for all of them. 0 for the likeliest colour of the cell
+    alone, as published."""
     moving: tuple[str, ...] = ()
     """Kinds of things that move, such as `door` and `robot`: if a real image shows an observed cell
     of theirs empty, the cells of these kinds that are connected with it are unknown again. Not as
@@ -252,7 +256,8 @@ class PersistModel(AssembledModel):
             )
         logits = ("persistence_logit", "empty_prior", "observation_logit")
         require_fields(self, "model", lambda value: value >= 0, "0 or more nats", *logits)
-        require(self.body_m >= 0, f"model.body_m is {self.body_m}: use 0 or more metres.")
+        metres = ("body_m", "colour_reach_m")
+        require_fields(self, "model", lambda value: value >= 0, "0 or more metres", *metres)
         known = sorted({name.partition("/")[0] for name in class_grid.names(self.memory)[1:]})
         for kind in self.moving:
             require(

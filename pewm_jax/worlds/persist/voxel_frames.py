@@ -139,7 +139,7 @@ def decode_classes(
     mask = jnp.full(before_XYZ.shape, OBSERVED, jnp.uint8) if mask_XYZ is None else mask_XYZ
     kept = jnp.asarray(model.kept_logits, jnp.float32)
 
-    def likeliest(slab: tuple[Array, Array, Array, ObservedCells | None]) -> Array:
+    def likeliest(slab: tuple[Array, Array, Array, ObservedCells | None]) -> tuple[Array, Any]:
         features, before, mask, evidence = slab
         scores = linear(weights["decoder"]["scores"], features).astype(jnp.float32)
         number, before = jnp.arange(config.classes), before[..., None]
@@ -147,13 +147,58 @@ def decode_classes(
         scores = scores + model.empty_prior * ((before == UNKNOWN) & (number == EMPTY))
         if evidence is not None:
             scores = scores + evidence_logits(model, evidence, config.classes)
-        return scores.argmax(-1).astype(jnp.int32)
+        made = scores.argmax(-1).astype(jnp.int32)
+        return made, _of_colours(model, made, scores) if model.colour_reach_m else None
 
     slab = config.slab or config.side
     whole = features, before_XYZ.astype(jnp.int32), mask, evidence if looked else None
     cut = jax.tree.map(lambda x: x.reshape(-1, slab, *x.shape[1:]), whole)
-    made = jax.lax.map(likeliest, cut).reshape(before_XYZ.shape)
+    made, colours = jax.tree.map(
+        lambda x: x.reshape(*before_XYZ.shape, *x.shape[4:]), jax.lax.map(likeliest, cut)
+    )
+    if colours is not None:
+        free = made != before_XYZ
+        if evidence is not None:
+            free = free & (evidence.colour_XYZ < 0)
+        made = _agreeing_colours(model, made, colours, free)
     return _within_storey(model, made, before_XYZ)
+
+
+SURE = 4.0
+"""Most nats that the colours of one cell differ by for its neighbours."""
+
+
+def _of_colours(model: PersistModel, made_XYZ: Array, scores: Array) -> Array:
+    """Return the nats (X, Y, Z, colours) by which a cell's kind is less likely in other colours."""
+    kinds = scores[..., 1:].reshape(*made_XYZ.shape, -1, model.memory.colours)
+    kind = jnp.maximum(made_XYZ - 1, 0) // model.memory.colours
+    own = jnp.take_along_axis(kinds, kind[..., None, None], -2)[..., 0, :]
+    return jnp.maximum(own - own.max(-1, keepdims=True), -SURE)
+
+
+def _agreeing_colours(
+    model: PersistModel, made_XYZ: Array, nats_XYZC: Array, free_XYZ: Array
+) -> Array:
+    """Return classes of which the free ones have the colour that is likeliest around them.
+
+    Nats are added over the cells of the same kind within ``model.colour_reach_m``.
+    """
+    colours, reach = model.memory.colours, round(model.colour_reach_m / model.cell)
+    kind_XYZ = jnp.where(made_XYZ > EMPTY, (made_XYZ - 1) // colours, UNKNOWN)
+
+    def of_kind(colour_XYZ: Array, kind: Array) -> tuple[Array, None]:
+        same = kind_XYZ == kind
+        near = jnp.where(same[..., None], nats_XYZC, 0.0)
+        for axis in range(3):
+            box = [1, 1, 1, 1]
+            box[axis] = 2 * reach + 1
+            near = jax.lax.reduce_window(near, 0.0, jax.lax.add, box, (1,) * 4, "SAME")
+        return jnp.where(same, near.argmax(-1), colour_XYZ), None
+
+    number = jnp.arange((model.backbone.voxel_vae.classes - 1) // colours)
+    colour_XYZ, _ = jax.lax.scan(of_kind, jnp.zeros(made_XYZ.shape, jnp.int32), number)
+    agreed = 1 + kind_XYZ * colours + colour_XYZ
+    return jnp.where(free_XYZ & (made_XYZ > EMPTY), agreed, made_XYZ).astype(made_XYZ.dtype)
 
 
 def _within_storey(model: PersistModel, made_XYZ: Array, before_XYZ: Array) -> Array:

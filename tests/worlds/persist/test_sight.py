@@ -140,6 +140,33 @@ def test_a_door_of_which_a_part_has_gone_is_unknown_until_it_is_seen_again():
         assert not forgotten(other, air).any()
 
 
+def test_cells_of_a_kind_agree_on_the_colour_of_guesses_nearby():
+    model = dataclasses.replace(ROOM, colour_reach_m=1.0)  # two cells
+    wall, floor = (class_grid.number_of(MEMORY, f"{kind}/red") for kind in ("wall", "floor"))
+    made = np.zeros((8, 8, 8), np.int32)
+    made[:, 2] = wall
+    odd = [(3, 2, 4), (0, 2, 4), (4, 6, 4)]  # amid the wall, the same but observed, and alone
+    for cell in odd:
+        made[cell] = wall + 1
+    made[:, :, 0] = floor + 5
+    nats = np.full((8, 8, 8, COLOURS), -persist_voxels.SURE)
+    nats[..., 0] = 0
+    for cell in odd:
+        nats[cell][0], nats[cell][1] = -1, 0
+    nats[:, :, 0] = 9 * (np.arange(COLOURS) == 5)
+    free = np.ones((8, 8, 8), bool)
+    free[0] = False
+    agreed = np.asarray(persist_voxels._agreeing_colours(model, made, nats, free))
+    expected = made.copy()
+    expected[3, 2, 4] = wall
+    np.testing.assert_array_equal(agreed, expected)
+    # Sure cells convince their neighbours, as far as the reach.
+    nats[:, 2, 1:, 0], nats[:, 2, 1:, 1] = 0, -0.01
+    nats[3, 2, 4, 0], nats[3, 2, 4, 1] = -persist_voxels.SURE, 0
+    agreed = np.asarray(persist_voxels._agreeing_colours(model, made, nats, free))
+    np.testing.assert_array_equal(np.flatnonzero(agreed[1:, 2, 4] == wall + 1) + 1, range(1, 6))
+
+
 def test_kinds_that_move_are_kinds_of_the_world():
     with pytest.raises(UserError, match=r"model.moving names 'wolf', and the kinds .* door"):
         dataclasses.replace(ROOM, moving=("door", "wolf"))
