@@ -195,7 +195,7 @@ def _agreeing_colours(
             near = jax.lax.reduce_window(near, 0.0, jax.lax.add, box, (1,) * 4, "SAME")
         return jnp.where(same, near.argmax(-1), colour_XYZ), None
 
-    number = jnp.arange((model.backbone.voxel_vae.classes - 1) // colours)
+    number = jnp.arange((len(class_grid.names(model.memory)) - 1) // colours)
     colour_XYZ, _ = jax.lax.scan(of_kind, jnp.zeros(made_XYZ.shape, jnp.int32), number)
     agreed = 1 + kind_XYZ * colours + colour_XYZ
     return jnp.where(free_XYZ & (made_XYZ > EMPTY), agreed, made_XYZ).astype(made_XYZ.dtype)

@@ -142,7 +142,8 @@ def test_a_door_of_which_a_part_has_gone_is_unknown_until_it_is_seen_again():
 
 def test_cells_of_a_kind_agree_on_the_colour_of_guesses_nearby():
     model = dataclasses.replace(ROOM, colour_reach_m=1.0)  # two cells
-    wall, floor = (class_grid.number_of(MEMORY, f"{kind}/red") for kind in ("wall", "floor"))
+    kinds = [name.partition("/")[0] for name in class_grid.names(MEMORY)]
+    wall, floor = kinds.index("wall"), kinds.index("floor")  # in the first colour
     made = np.zeros((8, 8, 8), np.int32)
     made[:, 2] = wall
     odd = [(3, 2, 4), (0, 2, 4), (4, 6, 4)]  # amid the wall, the same but observed, and alone
