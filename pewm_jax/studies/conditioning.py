@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.config import Config, UserError, to_dict
 from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
@@ -109,14 +110,18 @@ class Study:
         model: dict[str, Any] = {"control": control}
         if base.model.observed == "warped":
             model["observed"] = "every"
-        if getattr(base.model.codec, "gate", 0):
-            model["codec"] = dataclasses.replace(base.model.codec, gate=0)
+        start: dict[str, Any] = {"start": ""}
+        codec = base.model.codec
+        if not isinstance(codec, PixelConfig):  # the weights of an autoencoder are needed
+            start = {"start": train.start, "fresh": (r"(backbone|control)/.*",)}
+        elif codec.gate:
+            model["codec"] = dataclasses.replace(codec, gate=0)
         return dataclasses.replace(
             base.with_model(**model),
             train=dataclasses.replace(
                 train,
                 run=str(self.folder(name, seed)),
-                start="",
+                **start,
                 seed=seed,
                 video=stages[0],
                 adapt=stages[1],

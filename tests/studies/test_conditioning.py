@@ -52,6 +52,13 @@ def test_every_row_gives_its_actions_in_its_way_and_trains_one_stage():
     assert study.base.model.observed == "warped"
 
 
+def test_rows_keep_the_weights_of_a_learned_codec():
+    tiny = presets.load("egowm_tiny")
+    config = Study(tiny, Path("out")).config("channels", 0, 70)
+    assert config.model.codec == tiny.model.codec
+    assert (config.train.start, config.train.fresh) == ("codec", ("(backbone|control)/.*",))
+
+
 def test_rows_get_as_many_steps_as_their_time_allows_and_it_is_measured_once(tmp_path, monkeypatch):
     asked = []
 
