@@ -394,10 +394,10 @@ def cells_at(grid: ClassGrid, cell_m: float, points: np.ndarray) -> np.ndarray:
 
 def passable(config: Config, grid: ClassGrid, way: np.ndarray) -> bool:
     """Return whether ``LANE`` lanes side by side are empty in a grid; unknown cells are not."""
-    return _wide((cells_at(grid, config.model.cell, way) == class_grid.EMPTY).all(1))
+    return _passes((cells_at(grid, config.model.cell, way) == class_grid.EMPTY).all(1))
 
 
-def _wide(free_L: np.ndarray) -> bool:
+def _passes(free_L: np.ndarray) -> bool:
     """Return whether ``LANE`` lanes side by side are free."""
     return bool(np.convolve(free_L, np.ones(LANE, int), "valid").max(initial=0) >= LANE)
 
@@ -407,7 +407,7 @@ def open_doorways(config: Config, episode: Episode, at: int, context: int) -> li
 
     A doorway counts if it lies in the world's window at the present frame, ``at``, the recorded
     grid lets one pass by some lanes, and the observed frames show at least half of each of these
-    lanes empty. Frames before its door last moved show nothing of that.
+    lanes empty. Frames before anything in the way last changed, such as a door, do not count.
     """
     house, model = house_of(episode.scene), config.model
     if house is None:
@@ -433,7 +433,7 @@ def open_doorways(config: Config, episode: Episode, at: int, context: int) -> li
             since = context - int(np.argmin([*same[::-1], False]))
             shown = _points_shown(jax.tree.map(lambda x, k=since: x[k:], seen), way)
             free = (cells == class_grid.EMPTY).all(1)
-            if _wide(free & (shown.mean(1) >= SEEN_SHARE)):
+            if _passes(free & (shown.mean(1) >= SEEN_SHARE)):
                 found.append(way)
     return found
 

@@ -297,6 +297,18 @@ def test_the_page_of_egowm_has_the_numbers_of_the_cards(name):
         assert any(within(one, card[row][0]) for one in page[row]), row
 
 
+def test_the_page_of_persist_has_the_numbers_of_the_card():
+    def rows(path):
+        lines = (ROOT / path).read_text().splitlines()
+        cells = [[x.strip() for x in line.strip("|").split("|")] for line in lines]
+        return {one[0]: one[1:] for one in cells if len(one) == 3}
+
+    card, page = rows("pewm_jax/shipped/persist/README.md"), rows("docs/persist.md")
+    for start in ("IoU of", "PSNR of a known grid", "PSNR of frames", "FVD over", "doorways seen"):
+        (told,) = [cells for name, cells in card.items() if name.startswith(start)]
+        assert any(cells[0] == told[0] for cells in page.values()), start
+
+
 def test_a_notebook_becomes_a_page_with_its_pictures():
     text, pictures = pages.notebook(NOTEBOOKS[0])
     assert text.startswith("# A first rollout")

@@ -256,8 +256,12 @@ class PersistModel(AssembledModel):
             )
         logits = ("persistence_logit", "empty_prior", "observation_logit")
         require_fields(self, "model", lambda value: value >= 0, "0 or more nats", *logits)
-        metres = ("body_m", "colour_reach_m")
-        require_fields(self, "model", lambda value: value >= 0, "0 or more metres", *metres)
+        require(self.body_m >= 0, f"model.body_m is {self.body_m}: use 0 or more metres.")
+        reach = self.colour_reach_m
+        require(
+            reach == 0 or reach >= self.cell,
+            f"model.colour_reach_m is {reach}: use 0, or {self.cell} metres (a cell) or more.",
+        )
         known = sorted({name.partition("/")[0] for name in class_grid.names(self.memory)[1:]})
         for kind in self.moving:
             require(
@@ -267,7 +271,7 @@ class PersistModel(AssembledModel):
         optional = ("shown_logit", "guess_logit")
         hint = "0 or more nats, or -1"
         require_fields(self, "model", lambda value: value >= 0 or value == -1, hint, *optional)
-        for name in ("points", "observation_logit"):
+        for name in ("points", "observation_logit", "moving"):
             require(
                 self.clip.depth or not getattr(self, name),
                 f"model.{name} needs depth: use clip.depth true, or leave {name} out.",

@@ -327,7 +327,7 @@ def step(
     if start is None:
         start = grid_state.first_cell(model, grid.low_3, camera.world_from_camera[:3, 3])
     classes, real = known.classes_XYZ, known.rgb_HWC is not None
-    evidence, grid = _looked(model, grid, start, known, camera)
+    evidence, grid = _known_evidence(model, grid, start, known, camera)
     middle = grid_state.middle(model, grid.low_3, start)
     before = grid_state.window(model, grid.classes_XYZ, start)
     cache = grid_state.move_cache(model, history.voxels, history.start_3, start)
@@ -384,7 +384,7 @@ def _mask_window(model: PersistModel, grid: ClassGrid, start_3: Array) -> Array 
     return None if grid.mask_XYZ is None else grid_state.window(model, grid.mask_XYZ, start_3)
 
 
-def _looked(
+def _known_evidence(
     model: PersistModel, grid: ClassGrid, start_3: Array, known: KnownFrame, camera: Camera
 ) -> tuple[ObservedCells | None, ClassGrid]:
     """Return the evidence of a known frame, and a grid without what it shows to have moved."""
@@ -404,7 +404,7 @@ def _evidence(
 ) -> ObservedCells | None:
     """Return the evidence of a real image, if the model uses it and has depth."""
     guess, shown, observed = model.kept_logits
-    used = model.observation_logit or model.backbone.world_frames.map_embed
+    used = model.observation_logit or model.backbone.world_frames.map_embed or model.moving
     if not model.clip.depth or not (used or guess != observed or shown != observed):
         return None
     corner = grid.low_3 + start_3 * model.cell

@@ -132,7 +132,8 @@ def decode_classes(
     config = model.backbone.voxel_vae
     weights, dtype = params["voxel_vae"], jnp.dtype(model.dtype)
     looked = evidence is not None and model.observation_logit > 0
-    if not any(model.kept_logits) and not model.empty_prior and not looked:
+    changed = any(model.kept_logits) or model.empty_prior or looked or model.colour_reach_m
+    if not changed:
         made = voxel_vae.decode(config, weights, latents_BxyzC, dtype)[0]
         return _within_storey(model, made, before_XYZ)
     features = voxel_vae.features(config, weights, latents_BxyzC, dtype)[0]
@@ -148,7 +149,7 @@ def decode_classes(
         if evidence is not None:
             scores = scores + evidence_logits(model, evidence, config.classes)
         made = scores.argmax(-1).astype(jnp.int32)
-        return made, _of_colours(model, made, scores) if model.colour_reach_m else None
+        return made, _colour_nats(model, made, scores) if model.colour_reach_m else None
 
     slab = config.slab or config.side
     whole = features, before_XYZ.astype(jnp.int32), mask, evidence if looked else None
@@ -156,24 +157,25 @@ def decode_classes(
     made, colours = jax.tree.map(
         lambda x: x.reshape(*before_XYZ.shape, *x.shape[4:]), jax.lax.map(likeliest, cut)
     )
-    if colours is not None:
-        free = made != before_XYZ
-        if evidence is not None:
-            free = free & (evidence.colour_XYZ < 0)
-        made = _agreeing_colours(model, made, colours, free)
-    return _within_storey(model, made, before_XYZ)
+    made = _within_storey(model, made, before_XYZ)
+    if colours is None:
+        return made
+    free = made != before_XYZ
+    if evidence is not None:
+        free = free & (evidence.colour_XYZ < 0)
+    return _agreeing_colours(model, made, colours, free)
 
 
-SURE = 4.0
-"""Most nats that the colours of one cell differ by for its neighbours."""
+MOST_NATS = 4.0
+"""Most nats by which one cell makes a colour less likely for its neighbours."""
 
 
-def _of_colours(model: PersistModel, made_XYZ: Array, scores: Array) -> Array:
+def _colour_nats(model: PersistModel, made_XYZ: Array, scores: Array) -> Array:
     """Return the nats (X, Y, Z, colours) by which a cell's kind is less likely in other colours."""
     kinds = scores[..., 1:].reshape(*made_XYZ.shape, -1, model.memory.colours)
     kind = jnp.maximum(made_XYZ - 1, 0) // model.memory.colours
     own = jnp.take_along_axis(kinds, kind[..., None, None], -2)[..., 0, :]
-    return jnp.maximum(own - own.max(-1, keepdims=True), -SURE)
+    return jnp.maximum(own - own.max(-1, keepdims=True), -MOST_NATS)
 
 
 def _agreeing_colours(

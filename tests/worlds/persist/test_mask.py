@@ -95,6 +95,62 @@ def test_guesses_may_change_and_what_was_observed_stays(params):
     assert not top[..., 7].any()
 
 
+def test_decoded_guesses_agree_on_colours_but_kinds_and_what_was_seen_stay():
+    colours = 3
+    memory = dataclasses.replace(MASKED.memory, colours=colours)
+    nets = MASKED.backbone
+    vae = dataclasses.replace(nets.voxel_vae, classes=1 + 9 * colours)
+    alone = dataclasses.replace(
+        MASKED, memory=memory, backbone=dataclasses.replace(nets, voxel_vae=vae)
+    )
+    shapes = jax.eval_shape(lambda: worlds.init(alone, KEY)["voxel_vae"])
+    rng = np.random.default_rng(5)
+    drawn = jax.tree.map(lambda x: jnp.asarray(0.5 * rng.normal(size=x.shape), jnp.float32), shapes)
+    latents = jnp.asarray(rng.normal(size=(1, 4, 4, 4, 3)), jnp.float32)
+    before = jnp.full((8, 8, 8), class_grid.UNKNOWN, jnp.int16).at[0].set(4)
+    mask = jnp.zeros((8, 8, 8), jnp.uint8).at[:1].set(class_grid.OBSERVED)
+    colour = jnp.full((8, 8, 8), -1).at[1].set(2)
+    evidence = voxel_frames.ObservedCells(jnp.zeros((8, 8, 8), bool), colour)
+    decode = jax.jit(voxel_frames.decode_classes, static_argnums=0)
+
+    def classes(model):
+        found = decode(model, {"voxel_vae": drawn}, latents, before, evidence, mask)
+        return np.asarray(found)
+
+    reach = dataclasses.replace(alone, colour_reach_m=1.0)
+    one, many = classes(alone), classes(reach)
+    np.testing.assert_array_equal(one == 0, many == 0)
+    filled = one > 0
+    np.testing.assert_array_equal((one[filled] - 1) // colours, (many[filled] - 1) // colours)
+    np.testing.assert_array_equal(many[:2], one[:2])
+    assert (many != one).any()
+    wide = classes(dataclasses.replace(alone, colour_reach_m=8.0))
+    for kind in range(9):  # all cells of a kind vote for all others
+        of_kind = wide[2:][(wide[2:] - 1) // colours == kind]
+        assert len(set(of_kind[of_kind > 0].tolist())) <= 1
+
+
+@pytest.mark.slow
+def test_a_world_forgets_the_door_of_which_a_real_frame_shows_a_part_gone(params):
+    door = class_grid.number_of(MASKED.memory, "door")
+    frames = seen()
+    eye = np.asarray(frames.camera.world_from_camera)[-1, :3, 3]
+    moving = dataclasses.replace(MASKED, moving=("door",))
+    depth = np.full_like(frames.depth_THW, 3.0)
+    far = dataclasses.replace(frames, depth_THW=depth)
+    one = jax.tree.map(lambda x: x[-1:], far)
+    hidden = []
+    for model in (MASKED, moving):
+        world = jax.jit(worlds.start, static_argnums=0)(model, params, far)
+        everywhere = np.stack([eye - 5, eye + 5]).astype(np.float32)
+        world = persist.edit(world, class_grid.place, model.memory, everywhere, door)
+        after = jax.jit(worlds.observe, static_argnums=0)(model, params, world, one)
+        leaf = np.asarray(world.map.classes_XYZ) == door
+        still = np.asarray(class_grid.observed(after.map)) == class_grid.OBSERVED
+        hidden.append((leaf & still & (np.asarray(after.map.classes_XYZ) == door)).sum())
+    assert hidden[0] - hidden[1] > 0.8 * 8**3  # of the window, in which the doors are connected
+
+
 @pytest.mark.slow
 def test_a_real_frame_completes_anew_what_was_only_guessed(params, monkeypatch):
     """As if it had never been guessed; what was observed or shown is an input."""
@@ -410,6 +466,10 @@ def test_a_column_is_known_if_all_its_predicted_cells_are(storey):
 
 
 def test_settings_that_do_not_fit_are_refused():
+    with pytest.raises(ConfigError, match=r"model.colour_reach_m is 0.2: use 0, or 0.5 metres"):
+        dataclasses.replace(MASKED, colour_reach_m=0.2)
+    with pytest.raises(ConfigError, match=r"model.body_m is -1"):
+        dataclasses.replace(MASKED, body_m=-1.0)
     nets = MASKED.backbone
     for part, change, says in (
         ("world_frames", {"map_ids": 13}, "map_ids and map_cells are (13, 2)"),

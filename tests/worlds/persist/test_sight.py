@@ -150,7 +150,7 @@ def test_cells_of_a_kind_agree_on_the_colour_of_guesses_nearby():
     for cell in odd:
         made[cell] = wall + 1
     made[:, :, 0] = floor + 5
-    nats = np.full((8, 8, 8, COLOURS), -persist_voxels.SURE)
+    nats = np.full((8, 8, 8, COLOURS), -persist_voxels.MOST_NATS)
     nats[..., 0] = 0
     for cell in odd:
         nats[cell][0], nats[cell][1] = -1, 0
@@ -163,7 +163,7 @@ def test_cells_of_a_kind_agree_on_the_colour_of_guesses_nearby():
     np.testing.assert_array_equal(agreed, expected)
     # Sure cells convince their neighbours, as far as the reach.
     nats[:, 2, 1:, 0], nats[:, 2, 1:, 1] = 0, -0.01
-    nats[3, 2, 4, 0], nats[3, 2, 4, 1] = -persist_voxels.SURE, 0
+    nats[3, 2, 4, 0], nats[3, 2, 4, 1] = -persist_voxels.MOST_NATS, 0
     agreed = np.asarray(persist_voxels._agreeing_colours(model, made, nats, free))
     np.testing.assert_array_equal(np.flatnonzero(agreed[1:, 2, 4] == wall + 1) + 1, range(1, 6))
 
