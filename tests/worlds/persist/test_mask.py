@@ -99,10 +99,15 @@ def test_decoded_guesses_agree_on_colours_but_kinds_and_what_was_seen_stay():
     colours = 3
     memory = dataclasses.replace(MASKED.memory, colours=colours)
     nets = MASKED.backbone
-    vae = dataclasses.replace(nets.voxel_vae, classes=1 + 9 * colours)
-    alone = dataclasses.replace(
-        MASKED, memory=memory, backbone=dataclasses.replace(nets, voxel_vae=vae)
-    )
+    count = len(class_grid.names(memory))
+    parts = {
+        name: dataclasses.replace(getattr(nets, name), classes=count)
+        for name in ("voxel_vae", "camera_model", "renderer")
+    }
+    ids = count + colours + 1
+    frames = dataclasses.replace(nets.world_frames, map_ids=ids)
+    nets = dataclasses.replace(nets, world_frames=frames, **parts)
+    alone = dataclasses.replace(MASKED, memory=memory, backbone=nets)
     shapes = jax.eval_shape(lambda: worlds.init(alone, KEY)["voxel_vae"])
     rng = np.random.default_rng(5)
     drawn = jax.tree.map(lambda x: jnp.asarray(0.5 * rng.normal(size=x.shape), jnp.float32), shapes)
