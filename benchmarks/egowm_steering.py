@@ -16,7 +16,6 @@ from pathlib import Path
 import pewm_jax
 from pewm_jax.data.dataset import EpisodeSource
 from pewm_jax.eval import steering
-from pewm_jax.eval.metrics.selection import select_lpips, select_scs
 from pewm_jax.report.labels import compare_steering
 
 
@@ -41,15 +40,7 @@ def main() -> None:
     episodes = EpisodeSource(
         Path(given.data or config.data.path) / (given.split or config.evaluate.split)
     )
-    measures = steering.Measures()
-    if not given.colours:
-        clip = config.model.clip
-        ids = all(episodes[k].has_ids for k in range(len(episodes)))
-        measures = steering.Measures(
-            select_lpips(config.evaluate.lpips, clip.height, clip.width)[0],
-            select_scs(config.evaluate.scs, ids=ids)[0],
-            steering.shows_arms(episodes),
-        )
+    measures = steering.Measures() if given.colours else steering.Measures.chosen(config, episodes)
     found = steering.measure(
         config, params, episodes, given.clips, seed=given.seed, measures=measures
     )

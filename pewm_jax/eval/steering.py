@@ -37,6 +37,7 @@ from pewm_jax.eval.clips import ClipChoice, load_clip, stack
 from pewm_jax.eval.metrics.arms import arms_by_colour, arms_iou
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.metrics.perceptual import LPIPS
+from pewm_jax.eval.metrics.selection import select_lpips, select_scs
 from pewm_jax.eval.metrics.structure import Consistency, average
 from pewm_jax.eval.runner import workers
 from pewm_jax.eval.scoring import Tracked, tracked_of
@@ -45,7 +46,8 @@ from pewm_jax.io.progress import Meter
 from pewm_jax.io.store import ResultCache, map_resumable
 from pewm_jax.memory import rendering
 from pewm_jax.report.labels import steering_table
-from pewm_jax.types import Array, Control, Frames, Params
+from pewm_jax.types import Array, Camera, Control, Frames, Params
+from pewm_jax.worlds import world_model
 from pewm_jax.worlds.control import control_of
 
 TRUE, SHUFFLED, NONE, UNEMBEDDED, TRUTH = "true", "shuffled", "none", "unembedded", "truth"
@@ -69,6 +71,17 @@ class Measures:
     lpips: LPIPS | None = None
     structure: Consistency | None = None
     arms: bool = False
+
+    @classmethod
+    def chosen(cls, config: Config, episodes: Sequence[Episode]) -> Measures:
+        """Return what ``config.evaluate`` asks for and the episodes allow."""
+        clip, settings = config.model.clip, config.evaluate
+        ids = all(episodes[k].has_ids for k in range(len(episodes)))
+        return cls(
+            select_lpips(settings.lpips, clip.height, clip.width)[0],
+            select_scs(settings.scs, ids=ids)[0],
+            shows_arms(episodes),
+        )
 
     @property
     def names(self) -> dict[str, str]:
@@ -416,18 +429,16 @@ def _warped(config: Config, context: Frames, control: Any, painted: bool) -> Arr
     painted where its actions put them.
     """
     model, clip = config.model, config.model.clip
-    nearest = model.own_m if painted else 0.0
+    if model.own_m and not painted:
+        model = dataclasses.replace(model, own_m=0.0)
+    present = jax.tree.map(lambda x: x[:, -1:], as_signal(context))
 
-    def one(given: tuple[Frames, Any]) -> Array:
-        context, control = given
-        present = jax.tree.map(lambda x: x[-1:], as_signal(context))
-        depth = jnp.where(present.depth_THW < nearest, 0, present.depth_THW)
-        present = dataclasses.replace(present, depth_THW=depth)
-        camera = control_of(model, present.camera, control).camera
-        view = rendering.splat_frames(present, camera, clip.height, clip.width)
-        return rendering.fill_nearest(view).features_THWF[..., :3]
+    def camera_of(given: tuple[Camera, Any]) -> Camera:
+        return control_of(model, *given).camera
 
-    rgb = jax.lax.map(one, (context, control))
+    camera = jax.lax.map(camera_of, (present.camera, control))
+    view = world_model.splatted(model, present, camera)
+    rgb = jax.lax.map(rendering.fill_nearest, view).features_THWF[..., :3]
     if not painted:
         return rgb
     bones = draw_bones(

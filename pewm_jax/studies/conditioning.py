@@ -25,7 +25,6 @@ from pewm_jax.controls.actions import ModulationConfig
 from pewm_jax.data.dataset import MANIFEST, EpisodeSource
 from pewm_jax.errors import require
 from pewm_jax.eval import steering
-from pewm_jax.eval.metrics.selection import select_lpips, select_scs
 from pewm_jax.io import atomic, weights
 from pewm_jax.io.store import TABLE, ResultCache, file_hash, inputs_hash, require_same_inputs
 from pewm_jax.report.labels import PUBLISHED_FRAMES
@@ -205,13 +204,7 @@ def _trained_and_scored(study: Study, name: str, seed: int, steps: int, log: Log
         log(f"scoring {name} …")
         params = weights.load(folder / WEIGHTS)
         episodes = EpisodeSource(Path(config.data.path) / config.evaluate.split)
-        clip, settings = config.model.clip, config.evaluate
-        ids = all(episodes[k].has_ids for k in range(len(episodes)))
-        measures = steering.Measures(
-            select_lpips(settings.lpips, clip.height, clip.width)[0],
-            select_scs(settings.scs, ids=ids)[0],
-            steering.shows_arms(episodes),
-        )
+        measures = steering.Measures.chosen(config, episodes)
         found = steering.measure(config, params, episodes, study.clips, measures=measures)
         return found.facts() | {"clips_are": found.walks.about}
 
