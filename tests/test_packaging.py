@@ -103,6 +103,12 @@ def test_the_version_stands_in_one_place():
     assert cited[1] == version
 
 
+def test_shipped_weights_stay_small():
+    files = list((ROOT / "pewm_jax" / "shipped").rglob("*.safetensors"))
+    assert files
+    assert sum(file.stat().st_size for file in files) <= 60e6
+
+
 def _numbers(version):
     return [int(number) for number in version.split(".")]
 

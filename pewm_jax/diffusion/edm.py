@@ -55,6 +55,9 @@ class EDMConfig(Noise):
     rendering, with the noise of each level; below it they are free. Holes start from pure noise. 0:
     everything starts from pure noise. Training does not depend on it. About 1 lets the model revise
     what the memory shows but not move it."""
+    temperature: float = 1.0
+    """Factor of the noise that the sampler starts from; below 1 samples vary less and are more
+    likely ones (reduced temperature, arXiv 1807.03039)."""
     guidance: float = 1.0
     """Classifier-free guidance on the memory (in the world egowm: on the observed image, or on the
     text of Cosmos): 1 = off, above 1 pushes away from 'no memory'."""
@@ -70,6 +73,10 @@ class EDMConfig(Noise):
         require(
             min(self.sigma_data, self.rho) > 0 and self.log_std >= 0,
             "noise.sigma_data and noise.rho must be above 0, and noise.log_std at least 0.",
+        )
+        require(
+            0 <= self.temperature <= 1,
+            f"noise.temperature is {self.temperature}: use a factor from 0 to 1.",
         )
         require(
             self.rendered_until >= 0,
@@ -146,12 +153,16 @@ class EDMConfig(Noise):
     ) -> Array:
         """Follow the probability-flow ODE by Euler's or Heun's method (Alg. 1).
 
+        It starts from noise of ``temperature``.
+
         The ODE is dx/dσ = (x − x0) / σ. ``held`` is (B, t, …) latents and a mask that broadcasts
         with them: where it is True, x is latents + σ · noise at every σ ≥ ``rendered_until``. As
         the level is that of the whole clip, the network gets inputs as in training.
         """
         del key
         sigmas = np.asarray(self.levels(), np.float32)
+        if self.temperature != 1:
+            noise = noise * self.temperature
 
         def kept(x: Array, sigma: Array | float) -> Array:
             if held is None:

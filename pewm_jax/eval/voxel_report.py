@@ -7,6 +7,7 @@ need a data set of their own (``evaluate.long``), since its episodes are longer 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -167,7 +168,7 @@ def _inputs(key: Key, settings: Mapping[str, Any]) -> list[Any]:
     piece, name = key
     inputs: list[Any] = [VERSION, *key, MECHANISMS.get(name)]
     if key == (UNSEEN, AS_TRAINED):
-        inputs.append(settings["prior_sha256"])
+        inputs += [settings["prior_sha256"], "interval"]
     if piece in (LONG, BESIDE):
         inputs += [settings["long_sha256"], settings["frames"]]
     return [*inputs, settings["beside"][name]] if piece == BESIDE else inputs
@@ -260,10 +261,10 @@ def _facts(
     i3d: VideoDistance | None,
 ) -> dict[str, Any]:
     """Return all scores as plain values."""
-    own = {name: float(value) for name, value in found[UNSEEN, AS_TRAINED].items()}
+    unseen = {name: float(value) for name, value in found[UNSEEN, AS_TRAINED].items()}
     frames = int(found[KNOWN, AS_TRAINED]["count"][1])
     facts: dict[str, Any] = {
-        "unseen": own,
+        "unseen": {name: value for name, value in unseen.items() if not math.isnan(value)},
         "known": {"psnr": float(found[KNOWN, AS_TRAINED]["psnr"]), "frames": frames},
         "long": None,
         "rows": {row: {"iou": float(found[UNSEEN, row]["iou"])} for row in rows},

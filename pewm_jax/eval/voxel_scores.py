@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -28,7 +29,7 @@ import numpy as np
 from pewm_jax import worlds
 from pewm_jax.config import Config
 from pewm_jax.data.episodes import Episode
-from pewm_jax.eval import horizon
+from pewm_jax.eval import horizon, statistics
 from pewm_jax.eval.horizon import RecordedWalk
 from pewm_jax.eval.metrics.images import psnr, unit_colours
 from pewm_jax.eval.metrics.videos import VideoDistance
@@ -210,11 +211,42 @@ def _shown(model: Any, corner_3: Array, depth_THW: Array, camera: Camera) -> Arr
 
 def iou(cells: Sequence[UnseenCells], made: Sequence[np.ndarray]) -> float:
     """Return the intersection over union of walls over the unseen cells of all places."""
-    both = either = 0
-    for one, wall in zip(cells, made, strict=True):
-        both += int((wall & one.wall_XYZ & one.unseen_XYZ).sum())
-        either += int(((wall | one.wall_XYZ) & one.unseen_XYZ).sum())
-    return both / max(either, 1)
+    both, either = _overlaps(cells, made).sum(0)
+    return float(both / max(either, 1))
+
+
+def _overlaps(cells: Sequence[UnseenCells], made: Sequence[np.ndarray]) -> np.ndarray:
+    """Return (places, 2) numbers of unseen cells: walls in both, and in either."""
+    found = [
+        (
+            (wall & one.wall_XYZ & one.unseen_XYZ).sum(),
+            ((wall | one.wall_XYZ) & one.unseen_XYZ).sum(),
+        )
+        for one, wall in zip(cells, made, strict=True)
+    ]
+    return np.array(found, np.float64).reshape(-1, 2)
+
+
+def ratio_interval(
+    cells: Sequence[UnseenCells], made: Sequence[np.ndarray], base: Sequence[np.ndarray]
+) -> tuple[float, float]:
+    """Return the ends of the ratio of two IoUs: a percentile bootstrap over houses.
+
+    Both are NaN with fewer than two houses.
+    """
+    houses, index = np.unique([one.house for one in cells], return_inverse=True)
+    if len(houses) < 2:
+        return math.nan, math.nan
+    sums = np.zeros((2, len(houses), 2))
+    for k, walls in enumerate((made, base)):
+        np.add.at(sums[k], index, _overlaps(cells, walls))
+    both, either = np.moveaxis(statistics.drawn(len(houses)) @ sums, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own, other = both / either
+        ratios = own / other
+    tail = (1 - statistics.LEVEL) / 2
+    low, high = np.nanquantile(ratios, [tail, 1 - tail])
+    return float(low), float(high)
 
 
 def mean_layouts(
@@ -270,13 +302,17 @@ def unseen_scores(
 ) -> dict[str, Any]:
     """Return the IoU of unseen walls, and those of the baselines at their best settings."""
     layouts = mean_layouts(cells, others)
-    prior = max(iou(cells, [one >= cut for one in layouts]) for cut in THRESHOLDS)
+    cut = max(THRESHOLDS, key=lambda cut: iou(cells, [one >= cut for one in layouts]))
+    prior = [one >= cut for one in layouts]
     made = [one.made_XYZ for one in cells if one.made_XYZ is not None]
+    low, high = ratio_interval(cells, made, prior)
     return {
         "places": len(cells),
         "houses": len({one.house for one in cells}),
         "iou": iou(cells, made),
-        "prior": prior,
+        "prior": iou(cells, prior),
+        "times_low": low,
+        "times_high": high,
         "extended": extended(cells),
         "prior_places": len(others) or len(cells),
     }

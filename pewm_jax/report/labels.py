@@ -328,13 +328,17 @@ def voxel_table(found: Mapping[str, Any]) -> Table:
     if long:
         spans = zip((0, *long["ends"][:-1]), long["ends"], strict=True)
         heads += [f"PSNR, dB, {low + 1}–{high} ↑" for low, high in spans]
-        heads += ["lost, dB ↓", "doorways open", f"FVD, {long['frames']} frames ↓"]
+        heads += [
+            "PSNR, dB, observed before → after ↑",
+            "doorways open",
+            f"FVD, {long['frames']} frames ↓",
+        ]
     rows = []
     for name, scores in found["rows"].items():
         cells = [f"{scores['iou']:.3f}" if "iou" in scores else "–"]
         if long:
             cells += [f"{value:.2f}" for value in scores["psnr"]]
-            cells.append(f"{scores['lost']:+.2f}" if "lost" in scores else "–")
+            cells.append(" → ".join(f"{x:.2f}" for x in scores.get("seen", ())) or "–")
             doorways = scores.get("doorways")
             cells.append(f"{doorways[1]} of {doorways[0]}" if doorways else "–")
             cells.append(f"{scores['fvd']:.0f}" if "fvd" in scores else "–")
@@ -348,7 +352,12 @@ def format_voxels(metrics: Mapping[str, Any]) -> list[str]:
     if not found:
         return []
     unseen, known, long = found["unseen"], found["known"], found["long"]
-    ratio = f" ({unseen['iou'] / unseen['prior']:.2f} times)" if unseen["prior"] else ""
+    ratio = ""
+    if unseen["prior"]:
+        ends = ""
+        if "times_low" in unseen:
+            ends = f" [{unseen['times_low']:.2f}, {unseen['times_high']:.2f}]"
+        ratio = f" ({unseen['iou'] / unseen['prior']:.2f}{ends} times)"
     walls = (
         f"IoU of walls that no observed frame shows: {unseen['iou']:.3f}; of the mean layout of "
         f"other houses {unseen['prior']:.3f}{ratio}; of the observed walls, extended, "

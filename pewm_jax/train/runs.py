@@ -50,6 +50,7 @@ SAMPLER = (
     "model.noise.rho",
     "model.noise.ends",
     "model.noise.rendered_until",
+    "model.noise.temperature",
 )
 """Settings of the sampler, on which only stages that train on imagined clips depend."""
 MUTABLE_FIELDS = (

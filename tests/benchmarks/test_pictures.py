@@ -63,9 +63,10 @@ def test_pictures_of_a_world_of_voxels_are_drawn(tmp_path, monkeypatch):
     voxels = "--voxels --voxels.kinds groups --voxels.colours 8 --voxels.pictures cells"
     cells = "--voxels.cell 0.25 --voxels.side 40"
     assert program.main([*collect.split(), *voxels.split(), *cells.split()]) == 0
-    what = ("grown", "edit")
+    monkeypatch.setattr(persist_pictures, "WORLDS", 1)
+    what = ("grown", "edit", "worlds")
     settings = persist_pictures.Settings("persist", what=what, data=data, out=tmp_path, steps=1)
     persist_pictures.main(settings)
-    grown = cv2.imread(str(tmp_path / "grown.png"))
-    assert grown.std() > 0
+    for name in what:
+        assert cv2.imread(str(tmp_path / f"{name}.png")).std() > 0
     sys.modules.pop("persist_pictures")

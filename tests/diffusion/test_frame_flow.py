@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pewm_jax.config import ConfigError
+from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.diffusion.flow import PERSIST_PIXELS, PERSIST_VOXELS, FlowConfig, FrameFlowConfig
 from pewm_jax.worlds.persist.state import noisy_context
 
@@ -81,7 +82,7 @@ def test_times_are_drawn_per_frame_and_only_the_sampler_shifts_them():
     assert FrameFlowConfig.levels is FlowConfig.levels
 
 
-@pytest.mark.parametrize("config", [FlowConfig(), FrameFlowConfig()])
+@pytest.mark.parametrize("config", [FlowConfig(), FrameFlowConfig(), EDMConfig()])
 def test_with_a_temperature_the_sampler_starts_from_less_noise(config):
     noise = jax.random.normal(jax.random.key(3), (2, 3, 4))
 

@@ -67,6 +67,18 @@ def test_the_prior_is_the_mean_layout_of_other_houses_at_its_best_threshold():
     assert voxel_scores.unseen_scores(some, others)["prior"] == 12 / 14  # cut above one half
 
 
+def test_the_lead_over_the_prior_has_an_interval_over_houses():
+    wall, half = np.ones((2, 2, 2), bool), np.zeros((2, 2, 2), bool)
+    half[0] = True
+    alike = [cells(house, wall, wall) for house in "abab"]
+    assert voxel_scores.ratio_interval(alike, [wall] * 4, [half] * 4) == (2, 2)
+    unlike = [cells(house, wall, wall) for house in "abc"]
+    low, high = voxel_scores.ratio_interval(unlike, [wall, wall, half], [half] * 3)
+    assert 1 <= low < 5 / 3 < high <= 2
+    alone = [cells("a", wall, wall)]
+    assert np.isnan(voxel_scores.ratio_interval(alone, [wall], [half])).all()
+
+
 def test_observed_walls_are_extended_as_a_baseline():
     wall = np.zeros((9, 9, 9), bool)
     wall[1:8, 4, 2:7] = True
@@ -314,7 +326,10 @@ def test_mechanisms_are_settings_of_the_world_that_are_switched_off():
 
 
 FACTS = {
-    "unseen": {"iou": 0.3, "prior": 0.12, "extended": 0.19, "places": 24.0, "houses": 16.0},
+    "unseen": {
+        "iou": 0.3, "prior": 0.12, "times_low": 2.2, "times_high": 2.9, "extended": 0.19,
+        "places": 24.0, "houses": 16.0,
+    },
     "known": {"psnr": 22.5, "frames": 32},
     "long": {"data": "d", "walks": 2, "frames": 600, "ends": [200, 400, 600], "beside": ["small"]},
     "rows": {
@@ -335,7 +350,7 @@ def test_the_terminal_shows_each_score_and_a_row_for_each_mechanism():
     said = "\n".join(labels.format_voxels({"voxels": FACTS}))
     for wanted in (
         "0.300",
-        "0.120 (2.50 times)",
+        "0.120 (2.50 [2.20, 2.90] times)",
         "extended, 0.190",
         "22.50 dB",
         "+0.25 dB",
@@ -346,6 +361,7 @@ def test_the_terminal_shows_each_score_and_a_row_for_each_mechanism():
     table = labels.voxel_table(FACTS).text()
     assert len(table) == 4
     assert "empty_prior 0" in table[2]
+    assert "20.00 → 18.00" in table[2]
     assert "3 of 6" in table[2]
     assert "–" in table[3]
     short = FACTS | {"long": None, "rows": {"as trained": {"iou": 0.3}}}
