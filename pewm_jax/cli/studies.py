@@ -153,10 +153,10 @@ def table2(settings: Table2Settings) -> None:
     shared = ("tasks", "houses", "proposals", "policy", "cost", "videos", "multiples", "none")
     chosen = {name: getattr(settings, name) for name in shared}
     chosen["policy"], policy = _policy(settings.policy)
-    errand = study.Table2Config(plan=plan, **chosen)
+    study_config = study.Table2Config(plan=plan, **chosen)
     cost = costs.perceptual() if settings.cost == "lpips" else costs.Pixels()
     runtime.cache_compilation(settings.out)
-    page = study.run(settings.model, settings.out, errand, policy, cost)
+    page = study.run(settings.model, settings.out, study_config, policy, cost)
     print(f"table: {page}")
 
 
@@ -221,7 +221,7 @@ def practice(settings: PracticeSettings) -> None:
     from pewm_jax.studies import practice as study
     from pewm_jax.studies.practice_piece import PracticeConfig
 
-    errand = PracticeConfig(
+    study_config = PracticeConfig(
         houses=settings.houses,
         tasks=settings.tasks,
         practice=Practice(walks=settings.walks, blocks=settings.blocks),
@@ -230,7 +230,7 @@ def practice(settings: PracticeSettings) -> None:
         seeds=settings.seeds,
     )
     runtime.cache_compilation(settings.out)
-    page = study.run(settings.model, settings.policy, settings.out, errand)
+    page = study.run(settings.model, settings.policy, settings.out, study_config)
     print(f"table: {page}")
 
 

@@ -62,7 +62,7 @@ ACTIONS_NAMES = {
     "unembedded": "actions not embedded; cameras and drawings stay",
     "copy": "the observed frame, repeated",
     "warp": "the observed frame, warped",
-    "paint": "the same without the body, and its bones painted",
+    "paint": "warped without the body, arms painted from their bones",
     "true - shuffled": "true minus another clip's",
     "true - none": "true minus none",
     "true - unembedded": "true minus those not embedded",

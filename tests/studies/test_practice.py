@@ -297,7 +297,7 @@ def test_a_policy_that_gives_no_actions_is_refused(home, wrong):
 @pytest.mark.parametrize(
     "wrong", [{"seeds": (-1,)}, {"learning_rate": float("nan")}, {"shown": -1}, {"tasks": 0}]
 )
-def test_a_bad_errand_is_refused(wrong):
+def test_bad_settings_of_a_study_are_refused(wrong):
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         PracticeConfig(**wrong)
 

@@ -292,17 +292,17 @@ def test_a_model_trained_without_memory_gets_rows(made, tmp_path):
     config, params = without_memory()
     weights.save(tmp_path / "none" / "weights.safetensors", params)
     configuration.save(config, tmp_path / "none" / "config.json")
-    errand = dataclasses.replace(
+    asked = dataclasses.replace(
         ERRAND, tasks=(1,), videos=0, multiples=(1,), none=str(tmp_path / "none")
     )
     page = table2.run(
-        folder / "run", tmp_path / "out", errand, deciders.wanderer, costs.Pixels(), lambda _: None
+        folder / "run", tmp_path / "out", asked, deciders.wanderer, costs.Pixels(), lambda _: None
     )
     text = page.read_text()
     for what in ("ranking × 2", "one plan, open loop", "MPC, closed loop"):
         assert f"| {what} · a model trained without memory |" in text
         assert f"| {what} · reprojection, no network |" in text
-    wrong = dataclasses.replace(errand, none=str(folder / "run"))
+    wrong = dataclasses.replace(asked, none=str(folder / "run"))
     with pytest.raises(
         UserError, match="was trained with a memory: use a run trained only in stage 1"
     ):

@@ -140,7 +140,7 @@ def test_a_cell_changes_only_where_another_class_is_likelier_by_what_is_held(par
     np.testing.assert_array_equal(held(MODEL, params, latents, before), before)
 
 
-def test_a_cell_of_which_nothing_was_known_has_air_unless_a_class_is_likelier_by_the_doubt(params):
+def test_a_cell_of_which_nothing_was_known_has_air_unless_a_class_is_likelier_by_a_margin(params):
     latents = jax.random.normal(KEY, (1, 4, 4, 4, 3))
     unknown = jnp.full((8, 8, 8), class_grid.UNKNOWN).at[:4].set(3)
     models = [
