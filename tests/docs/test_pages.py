@@ -17,6 +17,7 @@ from docs.generate import code, links, pages
 from pewm_jax.cli import main as program
 from pewm_jax.cli import plugins
 from pewm_jax.errors import ConfigError
+from pewm_jax.studies import conditioning
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted(ROOT.glob("notebooks/*.ipynb"))
@@ -295,6 +296,13 @@ def test_the_page_of_egowm_has_the_numbers_of_the_cards(name):
     assert names <= card.keys() & page.keys()
     for row in card.keys() & page.keys() - {name for name in card if "mean over" in name}:
         assert any(within(one, card[row][0]) for one in page[row]), row
+
+
+@pytest.mark.parametrize("name", ["conditioning", "conditioning_humanoid"])
+def test_the_page_of_egowm_has_the_tables_of_its_ablation(name):
+    found = json.loads((ROOT / "docs" / "egowm" / f"{name}.json").read_text())
+    table = conditioning.table_of(found["results"], found["about"]["rows"]).markdown()
+    assert table in (ROOT / "docs" / "egowm.md").read_text()
 
 
 def test_the_page_of_persist_has_the_numbers_of_the_card():
