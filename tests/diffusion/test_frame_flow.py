@@ -111,6 +111,11 @@ def test_settings_that_cannot_work_are_refused(wrong):
         FrameFlowConfig(**wrong)
 
 
+def test_a_temperature_of_edm_above_1_is_refused():
+    with pytest.raises(ConfigError, match=r"noise\.temperature is 1\.5"):
+        EDMConfig(temperature=1.5)
+
+
 def test_times_at_the_ends_are_those_that_one_step_meets():
     config = FrameFlowConfig(per_frame=True, times="ends", sample_steps=1, context_noise=0.1)
     times = np.asarray(config.draw(jax.random.key(0), 500, 4))
