@@ -247,8 +247,8 @@ class ConditioningSettings:
     out: Path = Path("runs/conditioning")
     """Folder of the results."""
     preset: str = "egowm"
-    """Settings that all rows share: `egowm` or `egowm_humanoid` (25 degrees of freedom), which take
-    hours, or `egowm_tiny` or `egowm_humanoid_tiny`."""
+    """Settings that all rows share: `egowm` or `egowm_humanoid` (25 degrees of freedom), which need
+    the most time, or `egowm_tiny` or `egowm_humanoid_tiny`."""
     data: Path | None = None
     """Folder of the data set; by default the preset's."""
     minutes: float = 30.0

@@ -153,7 +153,7 @@ class EDMConfig(Noise):
     ) -> Array:
         """Follow the probability-flow ODE by Euler's or Heun's method (Alg. 1).
 
-        It starts from noise of ``temperature``.
+        The start is noise times ``temperature``.
 
         The ODE is dx/dσ = (x − x0) / σ. ``held`` is (B, t, …) latents and a mask that broadcasts
         with them: where it is True, x is latents + σ · noise at every σ ≥ ``rendered_until``. As

@@ -216,7 +216,7 @@ def iou(cells: Sequence[UnseenCells], made: Sequence[np.ndarray]) -> float:
 
 
 def _overlaps(cells: Sequence[UnseenCells], made: Sequence[np.ndarray]) -> np.ndarray:
-    """Return (places, 2) numbers of unseen cells: walls in both, and in either."""
+    """Return (places, 2) counts of unseen cells: intersection and union of the walls."""
     found = [
         (
             (wall & one.wall_XYZ & one.unseen_XYZ).sum(),
@@ -230,9 +230,9 @@ def _overlaps(cells: Sequence[UnseenCells], made: Sequence[np.ndarray]) -> np.nd
 def ratio_interval(
     cells: Sequence[UnseenCells], made: Sequence[np.ndarray], base: Sequence[np.ndarray]
 ) -> tuple[float, float]:
-    """Return the ends of the ratio of two IoUs: a percentile bootstrap over houses.
+    """Return the 95 % interval of the ratio of two IoUs, a percentile bootstrap over houses.
 
-    Both are NaN with fewer than two houses.
+    Both ends are NaN with fewer than two houses.
     """
     houses, index = np.unique([one.house for one in cells], return_inverse=True)
     if len(houses) < 2:
