@@ -146,11 +146,13 @@ def run(study: Study, log: Log = print) -> Path:
         UserError: the data are missing or unsuitable, or the folder has results of other settings.
         Interrupted: finished work is stored; the same call resumes.
     """
-    split = Path(study.base.data.path) / study.base.evaluate.split
+    names = {"data": "train", "split": study.base.evaluate.split}
+    folders = {key: Path(study.base.data.path) / name for key, name in names.items()}
+    for folder in folders.values():
+        EpisodeSource(folder)  # names a folder that does not exist, and how to make it
     about = {
         "model": inputs_hash([to_dict(study.base.model), to_dict(study.base.evaluate)]),
-        "data": file_hash(Path(study.base.data.path) / "train" / MANIFEST),
-        "split": file_hash(split / MANIFEST),
+        **{key: file_hash(folder / MANIFEST) for key, folder in folders.items()},
         "minutes": None if study.steps else study.minutes,
         "steps": study.steps,
         "clips": study.clips,

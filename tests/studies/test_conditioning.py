@@ -52,6 +52,12 @@ def test_every_row_gives_its_actions_in_its_way_and_trains_one_stage():
     assert study.base.model.observed == "warped"
 
 
+def test_absent_data_are_refused_with_the_command_that_makes_them(tmp_path):
+    study = Study(base(data=str(tmp_path / "none")), tmp_path / "out")
+    with pytest.raises(UserError, match=r"none/train does not exist; make it with"):
+        conditioning.run(study)
+
+
 def test_rows_keep_the_weights_of_a_learned_codec():
     tiny = presets.load("egowm_tiny")
     config = Study(tiny, Path("out")).config("channels", 0, 70)
