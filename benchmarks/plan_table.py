@@ -47,7 +47,9 @@ ADDED = {
     "denoised_lpips_weights": "signal",
     "frames": 0,
     "whole": 0.0,
-    "last_alone": False,
+    "asked_alone": False,
+    "draft": {"kind": "none"},
+    "start_draft": "",
 }
 """Settings that older records lack, with the values that change no program."""
 PRESETS = ("pewm_2b", "pewm_5b", "pewm_5b_i2v", "egowm_svd", "egowm_cosmos2b", "persist_xl")

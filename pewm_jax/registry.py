@@ -113,6 +113,10 @@ BUILT_IN: dict[str, dict[str, str]] = {
         "flow": "pewm_jax.diffusion.flow:FlowConfig",
         "frame_flow": "pewm_jax.diffusion.flow:FrameFlowConfig",
     },
+    "draft": {
+        "none": "pewm_jax.config.parts:Draft",
+        "network": "pewm_jax.worlds.draft:NetworkDraft",
+    },
     "format": {
         "7scenes": "pewm_jax.data.formats.seven_scenes:SevenScenes",
         "arkitscenes": "pewm_jax.data.formats.arkitscenes:ARKitScenes",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
-from pewm_jax.config.parts import Backbone, Codec, Conditioner, Memory, Noise
+from pewm_jax.config.parts import Backbone, Codec, Conditioner, Draft, Memory, Noise
 from pewm_jax.config.world import (
     PLANAR,
     ActionConfig,
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
     from pewm_jax.types import Array
 
 
-WhereObserved: TypeAlias = Literal["first", "every", "warped"]
+WhereObserved: TypeAlias = Literal["first", "every", "warped", "drafted"]
 """Where the observed frame conditions a clip: at its own latent frame alone; at every latent frame,
-as it is; or at every one, rendered from the camera of that frame by its depth."""
+as it is; at every one, rendered from the camera of that frame by its depth; or at every one, as the
+draft of that frame (``worlds.draft``)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,9 +42,11 @@ class AssembledModel(World):
             setting of the world, metres.
         observed: where the observed frame conditions a clip, a ``WhereObserved``; a setting of the
             worlds that declare this field.
+        draft: the network whose frames the model refines; a setting of the worlds that declare it.
     """
 
     observed = "first"  # without an annotation this is no field
+    draft = Draft()
     own_m = 0.0
 
     clip: ClipConfig = ClipConfig()
@@ -183,11 +186,18 @@ class AssembledModel(World):
         for settings in parts:
             settings.check(self)
         require(
-            self.observed in ("first", "every", "warped"),
-            f"model.observed is {self.observed!r}; choose first, every or warped.",
+            self.observed in get_args(WhereObserved),
+            f"model.observed is {self.observed!r}; choose one of "
+            f"{', '.join(get_args(WhereObserved))}.",
         )
         require(
             self.observed != "warped" or self.clip.depth,
             "model.observed is warped, which needs the depth of the observed frame, and clip.depth "
             "is false, so imagined frames have none: use model.observed every.",
         )
+        require(
+            (self.observed == "drafted") == self.draft.PREDICTS,
+            f"model.observed is {self.observed} and model.draft.kind {of(self.draft).name}: "
+            "model.observed drafted and model.draft.kind network go together.",
+        )
+        self.draft.check(self)

@@ -195,6 +195,7 @@ RENAMED_KINDS = {("reader", "attention"): "attend"}
 """Section and name of kinds in earlier versions → their names now."""
 
 RENAMED_SETTINGS = {
+    "pewm": {"last_alone": "asked_alone"},
     "persist": {
         "hold": "persistence_logit",
         "doubt": "empty_prior",

@@ -628,9 +628,12 @@ class Noise(Settings):
         rendered_until: the time down to which sampling keeps latents that the rendered memory
             covers; 0 for never. ``sample`` of a kind that has it takes the argument ``held``:
             ``(latents_BthwC, covered_Bthw1)``.
+        STARTS: whether ``sample`` takes the argument ``start``, (B, t, …) latents that sampling
+            starts from, with the noise of its first level added.
     """
 
     SECTION: ClassVar[str] = "noise"
+    STARTS: ClassVar[bool] = False
     guidance: Any = 1.0
     per_frame: Any = False
     rendered_until: Any = 0.0
@@ -682,3 +685,26 @@ class Noise(Settings):
             key: randomness of the steps, if the sampler draws noise.
         """
         raise NotImplementedError
+
+
+@dataclasses.dataclass(frozen=True)
+class Draft(Settings):
+    """No draft: the model imagines everything itself; and the base class of other kinds.
+
+    A draft is what another network predicts of a clip, and the model refines.
+
+    Attributes:
+        PREDICTS: whether there is such a network.
+    """
+
+    SECTION: ClassVar[str] = "draft"
+    PREDICTS: ClassVar[bool] = False
+
+    def of(self, model: Any) -> Any:
+        """Return the settings of the network that makes drafts, as a model."""
+        raise NotImplementedError
+
+    def init(self, model: Any, key: Array) -> Params:
+        """Return random parameters, {} for no draft."""
+        del model, key
+        return {}

@@ -205,6 +205,9 @@ class TrainSettings:
     """Folder with weights to start from, made by `pewm-jax convert import … --rgbd
     --camera` or an earlier run; if empty, weights are random. Weights that the first stage does not
     use, such as memory blocks in stage 1, are not loaded and start afresh later."""
+    start_draft: str = ""
+    """Run, or name of a model that ships, whose weights those of the draft are (`model.draft`),
+    unless the weights in `train.start` contain a draft."""
     optimizer: Literal["adam", "muon"] = "adam"
     """`adam`, or `muon` for the matrices of hidden layers (orthogonalised momentum, with Adam's
     size of step) and Adam for the rest; Muon needs fewer steps, and keeps one moment less."""

@@ -10,7 +10,7 @@ x / (1 + σ) = (1 − τ) x0 + τ ε and τ, and predicts ε − x0.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,8 @@ from pewm_jax.types import Array
 @dataclasses.dataclass(frozen=True)
 class EDMConfig(Noise):
     """Continuous noise σ with preconditioning (Karras et al. 2022, arXiv 2206.00364)."""
+
+    STARTS: ClassVar[bool] = True
 
     sigma_data: float = 0.5
     """Standard deviation of clean latents: about 1 for the codec `learned`, of which
@@ -150,10 +152,12 @@ class EDMConfig(Noise):
         key: Array | None = None,
         *,
         held: tuple[Array, Array] | None = None,
+        start: Array | None = None,
     ) -> Array:
         """Follow the probability-flow ODE by Euler's or Heun's method (Alg. 1).
 
-        The start is noise times ``temperature``.
+        Sampling starts from noise times ``temperature``, added to the latents ``start``, if given
+        (SDEdit, Meng et al. 2022, arXiv 2108.01073).
 
         The ODE is dx/dσ = (x − x0) / σ. ``held`` is (B, t, …) latents and a mask that broadcasts
         with them: where it is True, x is latents + σ · noise at every σ ≥ ``rendered_until``. As
@@ -186,8 +190,9 @@ class EDMConfig(Noise):
         deviation = sigmas[0]
         if self.target == "v":
             deviation = np.sqrt(deviation**2 + np.float32(self.sigma_data) ** 2)
-        start = kept((noise * deviation).astype(noise.dtype), sigmas[0])
-        x, _ = jax.lax.scan(step, start, (jnp.asarray(sigmas[:-1]), jnp.asarray(sigmas[1:])))
+        first = noise * deviation if start is None else start + noise * deviation
+        first = kept(first.astype(noise.dtype), sigmas[0])
+        x, _ = jax.lax.scan(step, first, (jnp.asarray(sigmas[:-1]), jnp.asarray(sigmas[1:])))
         if self.ends == "sigma_min":
             return x
         return (x - sigmas[-1] * slope(x, sigmas[-1])).astype(noise.dtype)  # Euler's, to σ = 0

@@ -83,7 +83,7 @@ class ImaginedRollout:
         batch: number of candidates imagined together, two batches at a time. It bounds memory use
             and changes results only by rounding.
         last: return only the last frame of each candidate; the others are not decoded or, with
-            ``model.last_alone``, not imagined.
+            ``model.asked_alone``, not imagined.
         memory: if False, the world's memory is not used.
     """
 

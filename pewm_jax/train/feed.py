@@ -297,13 +297,14 @@ def _folder(config: Config, stage: Stage, weights: str) -> Path:
         for part in ("backbone", "noise", *(() if stage.memory else ("memory",))):
             model.pop(part, None)
     reader, control = model.get("memory", {}).get("reader", {}), model.get("control", {})
-    model.pop("last_alone", None)  # what is prepared does not depend on it, nor on these
+    model.pop("asked_alone", None)  # what is prepared does not depend on it, nor on these
     for setting in ("inject", "body"):
         control.pop(setting, None)
     # The only values of earlier versions, whose prepared clips are still used.
     earlier = (reader, "picture", "pixels"), (model, "observed", "first")
     earlier = (*earlier, (model.get("noise", {}), "rendered_until", 0.0))
     earlier = (*earlier, (model, "own_m", 0.0), (control, "drawn", False))
+    earlier = (*earlier, (model, "draft", {"kind": "none"}))
     if model.get("codec", {}).get("kind") == "pixel":
         earlier = (*earlier, (model["codec"], "gate", 0))
     for section, setting, value in earlier:

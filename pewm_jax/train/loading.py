@@ -192,7 +192,16 @@ def encoder(config: Config) -> Params:
 
 def _start_weights(config: Config) -> Params:
     """Return the weights in ``train.start``, from its weights file or else from a checkpoint."""
-    folder = shipped.find(config.train.start)
+    params = _weights_of(config.train.start)
+    drafted = getattr(config.train, "start_draft", "")
+    if drafted and "draft" not in params:
+        params = {**params, "draft": _weights_of(drafted)}
+    return params
+
+
+def _weights_of(run: str) -> Params:
+    """Return the weights of a run, from its weights file or else from a checkpoint."""
+    folder = shipped.find(run)
     if (folder / runs.WEIGHTS).exists():
         return rollouts.load_finished(folder, lazily=True)[1]
     return load(folder)[1]

@@ -55,7 +55,7 @@ SAMPLER = (
 """Settings of the sampler, on which only stages that train on imagined clips depend."""
 MUTABLE_FIELDS = (
     "evaluate",
-    "model.last_alone",
+    "model.asked_alone",
     "data.features",
     "data.prepared_path",
     "data.workers",

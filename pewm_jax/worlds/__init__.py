@@ -177,7 +177,7 @@ def imagine_many(
         keys: (K,) randomness of each candidate; equal keys give equal noise.
         memory: see ``imagine``.
         last: return only the last frame of each, (K, 1). A world may then leave the others
-            undecoded or, with ``model.last_alone``, not imagine them; the frame then differs from
+            undecoded or, with ``model.asked_alone``, not imagine them; the frame then differs from
             that of ``last=False``.
         views: the result of ``views(…)(controls)`` for these controls, if it was computed.
 

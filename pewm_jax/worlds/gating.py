@@ -21,6 +21,7 @@ from pewm_jax.codecs.signals import as_signal, rgbd_signal
 from pewm_jax.config import AssembledModel, TrainSettings
 from pewm_jax.types import Array, Clip, Control, Frames, MemoryReadout, Params
 from pewm_jax.worlds import codec_losses, objective, perturbation, world_model
+from pewm_jax.worlds import draft as drafts
 
 LPIPS_WEIGHT = "gate_lpips"
 """Name of the setting with the weight of LPIPS in ``loss``."""
@@ -37,6 +38,8 @@ def prepare(
     """
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :history], frames)
+    if model.draft.PREDICTS:
+        clip = drafts.forgetful(model, clip)
     if memory:
         readout = objective.clip_readout(model, params, clip, pictures=True)
     else:
@@ -49,6 +52,9 @@ def prepare(
         more = {"noise_B": jnp.full(len(clean := observed.rgb_THWC), level), "clean_BTHWC": clean}
         noisy = clean + level * jax.random.normal(jax.random.fold_in(key, 2), clean.shape)
         observed = dataclasses.replace(observed, rgb_THWC=noisy)
+    if model.draft.PREDICTS:
+        drafted = drafts.everywhere(model, params, observed, control, readout)
+        more["everywhere_BthwC"] = drafted
     conditioning = world_model.condition(model, params, observed, control, **more)
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
     noise = jax.random.normal(key, shape)
@@ -57,6 +63,9 @@ def prepare(
         blind = world_model.blind(model, params, conditioning, jnp.ones(shape[0], bool))
     again = jax.random.fold_in(key, 1)
     latents = world_model.sample(model, params, conditioning, shown, noise, again, blind=blind)
+    if model.draft.PREDICTS:
+        blended = drafts.gated_view(model, params, drafted, readout.view)
+        readout = dataclasses.replace(readout, view=blended)
     return clip.without_context().with_extras(
         context_features_ShwF=None, latents_thwC=latents, readout=readout
     )

@@ -42,6 +42,8 @@ from pewm_jax.worlds.stages import FREEZE, TRAIN, Stage, is_of_this_package
 ROOT = "lora"
 """The branch of the parameters that holds the adapters."""
 PATHS = rf"{ROOT}/.*"
+OF_DRAFT = "draft/"
+"""Start of the paths of the parameters of the network that makes drafts."""
 BASE, BASE_HASH = "base", "base_sha256"
 """Metadata of a file of adapters: the folder of the start weights, and their hash."""
 _WEIGHTS = "weights.safetensors"
@@ -197,8 +199,10 @@ def adapters_of(params: Params) -> Iterator[tuple[str, Array, Array]]:
             yield path, flat[f"{path}/a"], b
 
 
-def takes_deferred(model: Task, path: str) -> bool:
+def takes_deferred(model: Any, path: str) -> bool:
     """Tell whether the network that uses a parameter takes a ``Deferred`` weight there."""
+    if path.startswith(OF_DRAFT):
+        model, path = model.draft.of(model), path.removeprefix(OF_DRAFT)
     part, parts = path.split("/", maxsplit=1)[0], [model]
     owners = {
         "backbone": ("backbone",),

@@ -31,6 +31,7 @@ from pewm_jax.models.lpips import model as lpips
 from pewm_jax.nn import placement
 from pewm_jax.types import Array, Camera, Clip, Control, Frames, MemoryReadout, Params, View
 from pewm_jax.worlds import codec_losses, perturbation, world_model
+from pewm_jax.worlds import draft as drafts
 from pewm_jax.worlds.control import require_actions
 
 
@@ -82,18 +83,27 @@ def prepare(
 
     Returns:
         The batch with the extras ``latents_thwC``, with a memory ``readout``, and with
-        ``model.observed`` `warped` ``everywhere_thwC``, made from the first ``history`` frames.
+        ``model.observed`` `warped` or `drafted` ``everywhere_thwC``, made from the first
+        ``history`` frames.
     """
     frames = as_signal(clip.frames)
-    warped = None
+    everywhere, readout = None, None
+    observed = jax.tree.map(lambda x: x[:, :history], frames)
     if model.observed == "warped":
-        observed = jax.tree.map(lambda x: x[:, :history], frames)
-        warped = world_model.everywhere(model, params, observed, frames.camera)
+        everywhere = world_model.everywhere(model, params, observed, frames.camera)
+    if model.draft.PREDICTS:
+        clip = drafts.forgetful(model, clip)
+    if memory:
+        readout = clip_readout(model, params, clip)
+    if model.draft.PREDICTS:
+        assert readout is not None, "a draft needs the memory"
+        control = Control(frames.camera, clip.actions_TA)
+        everywhere = drafts.everywhere(model, params, observed, control, readout)
     return clip.without_context().with_extras(
         context_features_ShwF=None,
         latents_thwC=rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
-        readout=clip_readout(model, params, clip) if memory else None,
-        everywhere_thwC=warped,
+        readout=readout,
+        everywhere_thwC=everywhere,
     )
 
 
@@ -267,13 +277,22 @@ def _observed(
     if train.chained:
         again = jax.random.fold_in(key, 5)
         first, depth = first_frames(
-            model, train.chained, params, frames, latents_BthwC, readout, again
+            model,
+            train.chained,
+            params,
+            frames,
+            latents_BthwC,
+            readout,
+            again,
+            clip.extras.get("everywhere_thwC"),
         )
     more = {"noise_B": level.reshape(batch), "clean_BTHWC": first}
     if model.observed == "warped":
         rows = math.ceil(train.chained * batch)
         warped = _warped(model, params, clip, Frames(first, depth, observed.camera), rows)
         more["everywhere_BthwC"] = _noisy(warped, level, jax.random.fold_in(image_key, 2))
+    elif model.draft.PREDICTS:
+        more["everywhere_BthwC"] = clip.extras["everywhere_thwC"]
     first = first + level * jax.random.normal(image_key, first.shape)
     if train.depth_noise:
         errors_key = jax.random.fold_in(image_key, 1)
@@ -333,6 +352,8 @@ def of_stage(
     frames: inside, XLA's CPU backend is slow.
     """
     settings, length = getattr(train, stage), model.clip.frames - 1
+    if model.draft.PREDICTS and "everywhere_thwC" not in clip.extras:
+        clip = jax.lax.stop_gradient(prepare(model, params, clip, memory=memory))
     of_some = functools.partial(denoise, memory=memory, perceptual=perceptual)
 
     def of_clips() -> tuple[Array, dict[str, Array], Denoised | None]:
@@ -447,6 +468,7 @@ def first_frames(
     latents_BthwC: Array,
     readout: MemoryReadout | None,
     key: Array,
+    everywhere_BthwC: Array | None = None,
 ) -> tuple[Array, Array]:
     """Return the first frames of a batch of clips, a share of them predicted by the model.
 
@@ -482,6 +504,7 @@ def first_frames(
             leading(latents_BthwC),
             leading(readout),
             key,
+            leading(everywhere_BthwC) if model.draft.PREDICTS else None,
         )
     )
     true = frames.rgb_THWC[:, :1], frames.depth_THW[:, :1]
@@ -520,6 +543,7 @@ def _predict_backwards(
     latents_BthwC: Array,
     readout: MemoryReadout | None,
     key: Array,
+    drafted_BthwC: Array | None = None,
 ) -> tuple[Array, Array]:
     """Run clips backwards in one denoising step, and return the predicted frames at their start."""
     back = jax.tree.map(lambda x: x[:, ::-1], frames)
@@ -530,7 +554,11 @@ def _predict_backwards(
     readout = None if readout is None else backwards(model, readout)
     view = None if readout is None else readout.view
     observed = jax.tree.map(lambda x: x[:, :1], back)
-    conditioning = world_model.condition(model, params, observed, Control(back.camera))
+    if drafted_BthwC is not None:
+        drafted_BthwC = drafted_BthwC[:, ::-1]
+    conditioning = world_model.condition(
+        model, params, observed, Control(back.camera), everywhere_BthwC=drafted_BthwC
+    )
     time_key, noise_key = jax.random.split(key)
     times = model.noise.draw(time_key, *x0.shape[:2])
     x_t = model.noise.corrupt(x0, jax.random.normal(noise_key, x0.shape), times)
@@ -541,5 +569,7 @@ def _predict_backwards(
     rgb, depth = (x[:, -1:] for x in rgbd.decode_rgbd(model, params, last))
     if view is not None and memories.gated(model):
         arrived: View = jax.tree.map(lambda x: x[:, -1:], view)
+        if drafted_BthwC is not None:
+            arrived = drafts.gated_view(model, params, drafted_BthwC[:, -1:], arrived)
         rgb, depth = rgbd.mix(model, params, rgb, depth, arrived)
     return rgb, depth if model.clip.depth else jnp.zeros_like(depth)

@@ -19,7 +19,7 @@ from pewm_jax.io import tree
 from pewm_jax.nn import deferred
 from pewm_jax.nn.deferred import Precision
 from pewm_jax.types import Params
-from pewm_jax.worlds.lora import takes_deferred
+from pewm_jax.worlds import lora
 
 WHOLE = ("codec", "encoder", "image", "text", "voxel_vae")
 """Branches of the parameters that are not quantized."""
@@ -40,11 +40,11 @@ def quantize(model: Task, params: Params, precision: str) -> Params:
     )
     leaves, count = tree.flatten(params), 0
     for path, leaf in leaves.items():
-        part = path.split("/", maxsplit=1)[0]
+        part = path.removeprefix(lora.OF_DRAFT).split("/", maxsplit=1)[0]
         floats = jnp.issubdtype(leaf.dtype, jnp.floating)
         if part in WHOLE or not (floats and deferred.is_matrix(path, leaf.shape)):
             continue
-        if takes_deferred(model, path):
+        if lora.takes_deferred(model, path):
             stacked = deferred.is_stacked(path)
             leaves[path] = deferred.quantize(leaf, precision, stacked=stacked)  # type: ignore[arg-type]
             count += 1

@@ -2,13 +2,15 @@
 
 Input channels, in order: noisy colour and depth latents; the observed frames in the backbone's form
 (by default their latents, zero for later frames); with ``model.observed`` `every` or `warped` the
-observed frame at every latent frame (``everywhere``); the channels of the control (Plücker rays).
-At the injection points of the backbone, a reader reads the memory.
+observed frame at every latent frame (``everywhere``), with `drafted` the draft of each frame; the
+channels of the control (Plücker rays). At the injection points of the backbone, a reader reads the
+memory.
 
 Parameters: ``backbone``, ``memory`` (the reader) and, if the settings need them, ``control``, the
-frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (the backbone's image encoder) and
-``text`` (the prompt's embedding, and a negative one's where guidance is on text). Without the
-``memory`` entry, or without a readout, it is the stage-1 model.
+frozen ``codec`` (the VAE), ``encoder`` (DINOv2), ``image`` (the backbone's image encoder),
+``draft`` (the network of ``worlds.draft``) and ``text`` (the prompt's embedding, and a negative
+one's where guidance is on text). Without the ``memory`` entry, or without a readout, it is the
+stage-1 model.
 """
 
 from __future__ import annotations
@@ -45,11 +47,13 @@ class ClipConditioning:
         backbone: the backbone's conditioning.
         camera: (B, T) cameras of the clips' frames.
         rays_BthwC: their Plücker rays at the latent rate, for readers.
+        draft_BthwC: latents of the clips' drafts, from which sampling starts; None without a draft.
     """
 
     backbone: Conditioning
     camera: Camera
     rays_BthwC: Array
+    draft_BthwC: Array | None = None
 
 
 def condition(
@@ -80,6 +84,7 @@ def condition(
     shown = backbones.observed(model, params, seen)
     steering = model.control.condition(model, params.get("control", {}), observed, control)
     if everywhere_BthwC is None:
+        assert model.observed != "drafted", "drafts are made by worlds.draft"
         everywhere_BthwC = everywhere(model, params, observed, control.camera, first)
     parts = (shown.joined_BthwC, everywhere_BthwC, steering.joined_BthwC)
     joined = [x for x in parts if x is not None]
@@ -89,7 +94,11 @@ def condition(
         modulation_BtE=steering.modulation_BtE,
         tokens_BLC=_text(model, params, batch, steering.tokens_BLC),
     )
-    return ClipConditioning(given, control.camera, camera_control.rays(model, control.camera))
+    rays = camera_control.rays(model, control.camera)
+    draft = None
+    if everywhere_BthwC is not None and model.draft.PREDICTS:
+        draft = everywhere_BthwC[..., :-1]
+    return ClipConditioning(given, control.camera, rays, draft)
 
 
 def everywhere(
@@ -162,8 +171,8 @@ def _warped(
 
     inputs = jax.tree.map(jnp.asarray, (observed, camera))
     encoded = placement.by_batch(of_batch, _codec(params), *inputs)
-    share = _share(model, encoded)
-    return jnp.where(share > 0, encoded.latents_thwC, 0), share
+    shown = share(model, encoded.seen_THW)
+    return jnp.where(shown > 0, encoded.latents_thwC, 0), shown
 
 
 def _codec(params: Params) -> Params:
@@ -171,9 +180,9 @@ def _codec(params: Params) -> Params:
     return {name: params[name] for name in ("codec",) if name in params}
 
 
-def _share(model: AssembledModel, encoded: EncodedView) -> Array:
-    """Return (B, t, h, w, 1) the share of each latent cell's pixels that a view shows."""
-    seen = encoded.seen_THW[..., None].astype(jnp.float32)
+def share(model: AssembledModel, seen_BTHW: Array) -> Array:
+    """Return (B, t, h, w, 1) the share of each latent cell's pixels that views show."""
+    seen = seen_BTHW[..., None].astype(jnp.float32)
     return fold(seen, model.codec.spatial, model.codec.temporal).mean(-1, keepdims=True)
 
 
@@ -243,6 +252,7 @@ def init(model: AssembledModel, key: Array, *, memory: bool = True) -> Params:
         "encoder": model.memory.encoder.init(jax.random.fold_in(frozen_key, 1)),
         "control": model.control.init(model, jax.random.fold_in(key, 3)),
         "image": model.backbone.init_image(jax.random.fold_in(key, 4)),
+        "draft": model.draft.init(model, jax.random.fold_in(key, 5)),
     }
     params |= {name: part for name, part in parts.items() if part}
     if model.backbone.stores_prompt:
@@ -338,6 +348,8 @@ def sample(
     more: dict[str, Any] = {}
     if noise.rendered_until and readout is not None:
         more = {"held": rendered_latents(model, params, readout)}
+    if conditioning.draft_BthwC is not None:
+        more["start"] = conditioning.draft_BthwC
     return noise.sample(denoise, noise_BthwC, key, **more)
 
 
@@ -357,5 +369,5 @@ def rendered_latents(
             return jax.lax.map(lambda one: memories.encode(model, weights, one), view)
 
         encoded = placement.by_batch(of_batch, _codec(params), readout.view)
-    covered = _share(model, encoded) >= COVERED
+    covered = share(model, encoded.seen_THW) >= COVERED
     return _seen(model, encoded.latents_thwC), covered

@@ -272,7 +272,7 @@ def test_the_last_frame_of_candidates_can_be_imagined_alone(count):
     one = random_frames(rng, count).camera
     cameras = jax.tree.map(lambda x: np.stack([x, x]), one)
     keys = jax.random.split(jax.random.key(0), 2)
-    alone = dataclasses.replace(MODEL, last_alone=True)
+    alone = dataclasses.replace(MODEL, asked_alone=True)
     views = alone.views(params, state)(cameras)
 
     def last(model, cameras, views=None):
@@ -293,11 +293,11 @@ def test_the_last_frame_of_candidates_can_be_imagined_alone(count):
 
 def test_frames_are_imagined_alone_only_with_cameras_and_codecs_of_single_frames():
     with pytest.raises(ConfigError, match="codec of single frames"):
-        dataclasses.replace(TINY, last_alone=True)
+        dataclasses.replace(TINY, asked_alone=True)
 
 
-def test_last_alone_may_change_when_a_run_is_resumed():
+def test_asked_alone_may_change_when_a_run_is_resumed():
     config = tiny_config(codec=MODEL.codec)
-    alone = config.with_model(last_alone=True)
+    alone = config.with_model(asked_alone=True)
     assert configuration.to_dict(alone) != configuration.to_dict(config)
     assert runs.identity(alone) == runs.identity(config)

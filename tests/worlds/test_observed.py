@@ -212,7 +212,7 @@ def test_chained_clips_are_not_shown_the_true_frame(monkeypatch):
     ready = objective.prepare(config.model, {}, clip, memory=False)
     seen = {}
 
-    def black(model, share, params, frames, latents, readout, key):
+    def black(model, share, params, frames, latents, readout, key, everywhere=None):
         return jnp.zeros_like(frames.rgb_THWC[:, :1]), frames.depth_THW[:, :1]
 
     def condition(*args, everywhere_BthwC, **more):
@@ -347,7 +347,7 @@ def test_warping_needs_depth_and_other_words_are_refused():
     with pytest.raises(ConfigError, match=r"model\.observed is warped, .* use model\.observed ev"):
         model_of("warped", clip=clip)
     model_of("every", clip=clip)
-    with pytest.raises(ConfigError, match=r"model\.observed is 'all'; choose first"):
+    with pytest.raises(ConfigError, match=r"model\.observed is 'all'; choose one of first"):
         model_of("all")
 
 

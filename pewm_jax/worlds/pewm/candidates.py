@@ -1,6 +1,6 @@
 """Many candidates from one state: shared parts are computed once, and only requested frames.
 
-Unless ``model.last_alone`` is set, a candidate imagines the same as ``imagine`` without
+Unless ``model.asked_alone`` is set, a candidate imagines the same as ``imagine`` without
 remembering. The present frame is encoded once. The rendered memory may be given (``Views``);
 otherwise it is rendered, on a CPU, once per distinct camera (equal beginnings lead to equal
 cameras), and not in both sides of a branch as under ``jax.vmap``. If only the last frame is
@@ -27,6 +27,7 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.config import AssembledModel
 from pewm_jax.memory import interface as memories
 from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params, View, WorldState
+from pewm_jax.worlds import draft as drafts
 from pewm_jax.worlds import world_model
 from pewm_jax.worlds.control import control_of
 
@@ -67,12 +68,14 @@ def imagine_clip(
     shown: slice,
     memory: bool,
     view: View | None = None,
+    alone: bool = False,
 ) -> Frames:
     """Imagine one clip of every candidate: (K, n) frames, ``shown`` of its T − 1.
 
     ``present`` is the present frame and whether all share it; else it has a leading axis K. The
     control has (K, T − 1) cameras, and actions that lead to them; ``view`` is the (K, T) rendered
-    memory, if it is known.
+    memory, if it is known. With ``alone``, ``shown`` is one frame, which is imagined without those
+    between it and the present one; a draft is still made of the whole clip.
     """
     frame, shared = present
     count = len(keys)
@@ -81,39 +84,103 @@ def imagine_clip(
         first = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), first)
     camera = jax.tree.map(lambda a, b: jnp.concatenate([a, b], 1), first, control.camera)
 
-    def condition(frame: Frames, control: Control) -> world_model.ClipConditioning:
-        one = jax.tree.map(lambda x: x[None], (frame, control))
-        return world_model.condition(model, params, *one)
-
-    whole = dataclasses.replace(control, camera=camera)
-    conditioning = jax.vmap(condition, (None if shared else 0, 0))(frame, whole)
-    reads = memory and "memory" in params
+    whole, drafted = dataclasses.replace(control, camera=camera), None
+    over = None if shared else 0, 0, 0
+    rows = np.array([0, shown.stop]) if alone else np.arange(1 + shown.stop)
+    if alone and not model.draft.PREDICTS:
+        camera, view = _taken((camera, view), rows)
+    reads = memory and ("memory" in params or model.draft.PREDICTS)
     readout = read_memory(model, remembered, camera, params, view) if reads else None
+    if readout is None and model.draft.PREDICTS:
+        readout = _of_present(model, params, frame, camera, shared=shared)
+    if readout is not None and model.draft.PREDICTS:
+        drafted = jax.vmap(functools.partial(_draft, model, params), over)(frame, whole, readout)
+    if alone:
+        model = dataclasses.replace(model, clip=dataclasses.replace(model.clip, frames=2))
+        if drafted is not None:
+            assert readout is not None
+            camera = _taken(camera, rows)
+            readout, drafted = _alone(readout, drafted, rows)
+        whole, shown = Control(camera), slice(0, 1)
+        control = Control(jax.tree.map(lambda x: x[:, 1:], camera))
+    condition = functools.partial(_condition, model, params)
+    conditioning = jax.vmap(condition, over)(frame, whole, drafted)
     batched = jax.tree.map(lambda x: x[:, None], readout)
     draw = functools.partial(world_model.draw, model, params)
     latents = jax.vmap(draw)(conditioning, batched, keys)[:, 0]
     seen = slice(shown.start + 1, shown.stop + 1)  # frame 0 of a clip is the present one
-    if model.codec.framewise:  # only the frames that are returned are decoded
-        rgb, depth = rgbd.decode_rgbd(model, params, latents[:, seen])
-    else:  # one candidate at a time: a video codec's activations need more memory than the rest
-
-        def decode(latents_thwC: Array) -> tuple[Array, Array]:
-            rgb, depth = rgbd.decode_rgbd(model, params, latents_thwC[None])
-            return rgb[0, seen], depth[0, seen]
-
-        rgb, depth = jax.lax.map(decode, latents)
+    rgb, depth = _decoded(model, params, latents, seen)
     if readout is not None and readout.view is not None and memories.gated(model):
-        remembered_there = jax.tree.map(lambda x: x[:, seen], readout.view)
+        blended = readout.view
+        if drafted is not None:
+            blended = drafts.gated_view(model, params, drafted, blended)
+        remembered_there = jax.tree.map(lambda x: x[:, seen], blended)
         rgb, depth = rgbd.mix(model, params, rgb, depth, remembered_there)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
     return Frames(rgb, depth, jax.tree.map(lambda x: x[:, shown], control.camera))
+
+
+def _decoded(
+    model: AssembledModel, params: Params, latents_KthwC: Array, seen: slice
+) -> tuple[Array, Array]:
+    """Return colours and depth of the frames ``seen`` of K clips."""
+    if model.codec.framewise:  # only the frames that are returned are decoded
+        return rgbd.decode_rgbd(model, params, latents_KthwC[:, seen])
+
+    # One candidate at a time: a video codec's activations need more memory than the rest.
+    def decode(latents_thwC: Array) -> tuple[Array, Array]:
+        rgb, depth = rgbd.decode_rgbd(model, params, latents_thwC[None])
+        return rgb[0, seen], depth[0, seen]
+
+    return jax.lax.map(decode, latents_KthwC)
+
+
+def _taken(parts: Any, rows: np.ndarray) -> Any:
+    """Return some of the (K, T) frames of arrays."""
+    return jax.tree.map(lambda x: x[:, rows], parts)
+
+
+def _alone(readout: MemoryReadout, drafted: Array, rows: np.ndarray) -> tuple[Any, Array]:
+    """Return the readout and the drafts of some of the (K, T) frames; tokens have no frames."""
+    view, encoded, drafted = _taken((readout.view, readout.encoded, drafted), rows)
+    return dataclasses.replace(readout, view=view, encoded=encoded), drafted
+
+
+def _draft(
+    model: AssembledModel, params: Params, frame: Frames, control: Control, readout: MemoryReadout
+) -> Array:
+    """Return the draft of one candidate, (t, h, w, C + 1)."""
+    one = jax.tree.map(lambda x: x[None], (frame, control, readout))
+    return drafts.everywhere(model, params, *one)[0]
+
+
+def _condition(
+    model: AssembledModel, params: Params, frame: Frames, control: Control, drafted: Array | None
+) -> world_model.ClipConditioning:
+    """Return the conditioning of one candidate."""
+    frame, control, drafted = jax.tree.map(lambda x: x[None], (frame, control, drafted))
+    return world_model.condition(model, params, frame, control, everywhere_BthwC=drafted)
+
+
+def _of_present(
+    model: AssembledModel, params: Params, frame: Frames, camera: Camera, *, shared: bool
+) -> MemoryReadout:
+    """Return the readout of K clips whose memory holds their present frame alone."""
+
+    def one(frame: Frames, camera: Camera) -> MemoryReadout:
+        held = drafts.present_alone(model, params, frame)
+        return memories.readout(model, held, camera, params=params, pictures=True)
+
+    if shared:
+        return jax.lax.map(lambda camera: one(frame, camera), camera)
+    return jax.lax.map(lambda both: one(*both), (frame, camera))
 
 
 def read_memory(
     model: AssembledModel, remembered: Any, camera: Camera, params: Params, view: View | None = None
 ) -> MemoryReadout:
     """Return the readout of K clips, leading axis K; ``view`` (K, T) is the rendering, if known."""
-    pictures = memories.gated(model)
+    pictures = memories.gated(model) or model.draft.PREDICTS
     reader = model.memory.reader
     each = functools.partial(memories.readout, model, remembered, params=params, pictures=pictures)
     if not (pictures or reader.READS_VIEW):

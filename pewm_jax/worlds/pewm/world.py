@@ -20,14 +20,26 @@ from pewm_jax.codecs import rgbd
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import AssembledModel, TrainConfig, TrainSettings, UserError, register
 from pewm_jax.config.assembled import WhereObserved
+from pewm_jax.config.parts import Draft
 from pewm_jax.errors import require
 from pewm_jax.memory import coverage as memory_coverage
 from pewm_jax.memory import interface as memories
-from pewm_jax.types import Array, Control, Frames, MemoryReadout, Params, View, WorldState
+from pewm_jax.registry import part
+from pewm_jax.types import Array, Camera, Control, Frames, MemoryReadout, Params, View, WorldState
 from pewm_jax.worlds import checks, gating, objective, sharpen, world_model
+from pewm_jax.worlds import draft as drafts
 from pewm_jax.worlds.control import control_of, cut_into_clips, join_clips, last_frames
 from pewm_jax.worlds.pewm import candidates
 from pewm_jax.worlds.stages import ADVERSARY, FREEZE, TRAIN, Stage
+
+
+def _require_no_draft(model: AssembledModel) -> None:
+    """Refuse a model with a draft, which is made from the memory."""
+    if model.draft.PREDICTS:
+        raise UserError(
+            "train.stage1.steps is above 0, and stage 1 has no memory, from which model.draft is "
+            "made: set it to 0."
+        )
 
 
 def require_gate(model: AssembledModel) -> None:
@@ -40,7 +52,8 @@ def require_gate(model: AssembledModel) -> None:
         )
 
 
-FROZEN = r"(codec|encoder|image|text)/.*"
+FROZEN = r"(codec|encoder|image|text|draft)/.*"
+PREPARES_BY = ("codec", "encoder", "draft")
 STAGE_1 = Stage(
     name="stage1",
     number=1,
@@ -48,15 +61,18 @@ STAGE_1 = Stage(
     init=functools.partial(world_model.init, memory=False),
     loss=objective.without_memory,
     prepare=functools.partial(objective.prepare, memory=False),
+    prepares_by=PREPARES_BY,
+    require=_require_no_draft,
 )
 STAGE_2 = Stage(
     name="stage2",
     number=2,
-    rules=((r"memory/.*", TRAIN), (r"(backbone|control|codec|encoder|image|text)/.*", FREEZE)),
+    rules=((r"memory/.*", TRAIN), (r"(backbone|control)/.*", FREEZE), (FROZEN, FREEZE)),
     init=world_model.init,
     loss=objective.with_memory,
     memory=True,
     prepare=functools.partial(objective.prepare, memory=True),
+    prepares_by=PREPARES_BY,
 )
 JOINT = dataclasses.replace(
     STAGE_2,
@@ -72,13 +88,14 @@ GATE = Stage(
     number=4,
     rules=(
         (r"codec/gate/.*", TRAIN),
-        (r"(backbone|control|memory|codec|encoder|image|text)/.*", FREEZE),
+        (r"(backbone|control|memory)/.*", FREEZE),
+        (FROZEN, FREEZE),
     ),
     init=world_model.init,
     loss=gating.loss,
     memory=True,
     prepare=gating.prepare,
-    prepares_by=("backbone", "control", "memory", "codec", "encoder", "image", "text"),
+    prepares_by=("backbone", "control", "memory", "image", "text", *PREPARES_BY),
     optional=True,
     extra_weights=gating.perceptual_weights,
     require=require_gate,
@@ -112,6 +129,11 @@ the memory reader, which has no effect at first, and trains only the reader. ``j
 and ``gate`` the codec's gate on imagined clips; these two are ours, and skipped without steps."""
 
 
+def _joined(first: Camera, later: Camera) -> Camera:
+    """Return cameras one after the other."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), first, later)
+
+
 @register("world", "pewm")
 @dataclasses.dataclass(frozen=True)
 class PEWM(memories.MemoryEdits, AssembledModel):
@@ -122,19 +144,24 @@ class PEWM(memories.MemoryEdits, AssembledModel):
     observed: WhereObserved = "first"
     """Where the observed frame conditions a clip. `first`: at its own latent frame. `every`: its
     latents at every latent frame. `warped`: its colour and depth, rendered from each frame's camera
-    and encoded; holes are marked by a mask. The last two add input channels to the backbone."""
+    and encoded; holes are marked by a mask. `drafted`: the frames of `model.draft`, and a mask of
+    what the memory shows. All but `first` add input channels to the backbone."""
 
-    last_alone: bool = False
-    """Candidates of which only the last frame is asked for, as in planning, imagine the last frame
-    of each clip without those before it. For models that were trained on frames drawn from clips
-    (`train.joint.frames`)."""
+    draft: Draft = part("draft", "none")
+    """A finished network whose frames the model refines."""
+
+    asked_alone: bool = False
+    """Imagine only the frames that are asked for: of a clip that is asked for in part, as for one
+    step in the viewer, its first ones, and of candidates of which only the last frame is asked for,
+    as in planning, the last frame of each clip. For models that were trained on frames drawn from
+    clips (`train.joint.frames`)."""
 
     def __post_init__(self):
         """Validate."""
         super().__post_init__()
         require(
-            not self.last_alone or (self.codec.temporal == 1 and not self.control.actions),
-            "model.last_alone is true, which needs cameras as control and a codec of single "
+            not self.asked_alone or (self.codec.temporal == 1 and not self.control.actions),
+            "model.asked_alone is true, which needs cameras as control and a codec of single "
             "frames: set it to false.",
         )
 
@@ -155,7 +182,11 @@ class PEWM(memories.MemoryEdits, AssembledModel):
 
     def sharding(self) -> tuple[tuple[str, Any], ...]:
         """Return the rules of all parts, and of the discriminator."""
-        return (*super().sharding(), *sharpen.SHARDING)
+        rules = (*super().sharding(), *sharpen.SHARDING)
+        if not self.draft.PREDICTS:
+            return rules
+        own = self.draft.of(self).sharding()
+        return (*rules, *((f"draft/{pattern}", spec) for pattern, spec in own))
 
     def start(self, params: Params, frames: Frames) -> WorldState:
         """Begin a world; see ``worlds.start``."""
@@ -184,8 +215,10 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         """Imagine clip after clip; see ``worlds.imagine``."""
         asked = control_of(self, state.frame.camera, control)
         count = asked.camera.world_from_camera.shape[0]
-        chunked, wanted = cut_into_clips(asked, self.clip.frames - 1, self.control.still)
+        length = self.clip.frames - 1
+        chunked, wanted = cut_into_clips(asked, length, self.control.still)
         clips = chunked.camera.world_from_camera.shape[0]
+        rest = count % length if self.asked_alone else 0
 
         def step(state: WorldState, inputs: tuple[Control, Array, Array | None]) -> Any:
             chunk, clip_key, valid = inputs
@@ -194,8 +227,19 @@ class PEWM(memories.MemoryEdits, AssembledModel):
             )
 
         inputs = (chunked, jax.random.split(key, clips), wanted)
-        state, frames = jax.lax.scan(step, state, inputs)
-        return state, join_clips(frames, count)
+        if not rest:
+            state, frames = jax.lax.scan(step, state, inputs)
+            return state, join_clips(frames, count)
+        made = []
+        if clips > 1:
+            whole = (*(jax.tree.map(lambda x: x[:-1], part) for part in inputs[:2]), None)
+            state, frames = jax.lax.scan(step, state, whole)
+            made = [join_clips(frames, count - rest)]
+        chunk, clip_key = jax.tree.map(lambda x: x[-1], inputs[:2])
+        state, frames = self.imagine_clip(
+            params, state, chunk, clip_key, remember=remember, memory=memory, asked=rest
+        )
+        return state, jax.tree.map(lambda *x: jnp.concatenate(x), *made, frames)
 
     def imagine_clip(
         self,
@@ -207,28 +251,46 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         remember: bool = True,
         memory: bool = True,
         valid_T: Array | None = None,
+        asked: int = 0,
     ) -> tuple[WorldState, Frames]:
         """Imagine one clip: the T − 1 frames after the present one.
 
-        ``valid_T`` is True for the leading frames that were asked for; None if all were. If the
-        denoiser works without depth (``clip.depth``), depth is 0 everywhere, and memories ignore
-        these frames.
+        ``valid_T`` is True for the leading frames that were asked for; None if all were. With
+        ``asked`` only so many leading frames are imagined; a draft is still made of the whole clip.
+        If the denoiser works without depth (``clip.depth``), depth is 0 everywhere, and memories
+        ignore these frames.
         """
-        present, future = state.frame, control.camera
-        camera = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), present.camera, future)
-        whole = dataclasses.replace(control, camera=camera)
+        present, count = state.frame, asked or self.clip.frames - 1
+        whole = dataclasses.replace(control, camera=_joined(present.camera, control.camera))
+        camera = jax.tree.map(lambda x: x[: 1 + count], whole.camera)
+        future = jax.tree.map(lambda x: x[1:], camera)
         whole = jax.tree.map(lambda x: x[None], whole)
         observed = jax.tree.map(lambda x: x[None], present)
-        conditioning = world_model.condition(self, params, observed, whole)
-        readout = None
-        if memory and "memory" in params:
-            gated = memories.gated(self)
-            shown = memories.readout(self, state.map, camera, params=params, pictures=gated)
+        readout, drafted = None, None
+        remembered = state.map
+        if self.draft.PREDICTS and not memory:
+            memory, remembered = True, drafts.present_alone(self, params, present)
+        if memory and ("memory" in params or self.draft.PREDICTS):
+            gated = memories.gated(self) or self.draft.PREDICTS
+            shown = memories.readout(self, remembered, camera, params=params, pictures=gated)
             readout = jax.tree.map(lambda x: x[None], shown)
-        latents = world_model.draw(self, params, conditioning, readout, key)
-        rgb, depth = rgbd.decode_rgbd(self, params, latents)
-        if readout is not None and memories.gated(self):
-            rgb, depth = rgbd.mix(self, params, rgb, depth, readout.view)
+        if self.draft.PREDICTS:
+            shown = drafts.lasting(readout, self.clip.frames)
+            drafted = drafts.everywhere(self, params, observed, whole, shown)[:, : 1 + count]
+        model = self
+        if asked:
+            model = dataclasses.replace(self, clip=dataclasses.replace(self.clip, frames=1 + asked))
+            whole = Control(jax.tree.map(lambda x: x[None], camera))
+        conditioning = world_model.condition(
+            model, params, observed, whole, everywhere_BthwC=drafted
+        )
+        latents = world_model.draw(model, params, conditioning, readout, key)
+        rgb, depth = rgbd.decode_rgbd(model, params, latents)
+        if readout is not None and memories.gated(model):
+            view = readout.view
+            if drafted is not None:
+                view = drafts.gated_view(model, params, drafted, view)
+            rgb, depth = rgbd.mix(model, params, rgb, depth, view)
         depth = depth if self.clip.depth else jnp.zeros_like(depth)
         frames = Frames(rgb[0, 1:], depth[0, 1:], future)
         remembered = state.map
@@ -274,7 +336,7 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         """Imagine K candidates; ``views`` is the result of ``candidates.Views``.
 
         The computation is that of ``imagine`` without ``remember``, but shared parts are computed
-        once; see ``worlds.pewm.candidates``. With ``last`` and ``last_alone``, a clip is its last
+        once; see ``worlds.pewm.candidates``. With ``last`` and ``asked_alone``, a clip is its last
         frame alone.
         """
         asked = jax.vmap(lambda control: control_of(self, state.frame.camera, control))(controls)
@@ -287,19 +349,15 @@ class PEWM(memories.MemoryEdits, AssembledModel):
             here = slice(number * length, min((number + 1) * length, count))
             size = here.stop - here.start
             view = None if views is None else jax.tree.map(lambda x, n=number: x[:, n], views)
-            model = self
-            if last and self.last_alone:
-                model = dataclasses.replace(self, clip=dataclasses.replace(self.clip, frames=2))
-                view = jax.tree.map(lambda x, n=size: x[:, jnp.array([0, n])], view)
-                here, size = slice(here.stop - 1, here.stop), 1
             frames = candidates.imagine_clip(
-                model,
+                self,
                 params,
                 (present, shared),
                 state.map,
-                candidates.clip_control(asked, here, model.clip.frames - 1, self.control.still),
+                candidates.clip_control(asked, here, length, self.control.still),
                 keys_KC[:, number],
                 shown=slice(size - 1 if last else 0, size),
+                alone=last and self.asked_alone,
                 memory=memory,
                 view=view,
             )
