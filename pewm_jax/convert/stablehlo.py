@@ -123,9 +123,17 @@ def denoise_program(config: Config, params: Params, batch: int = 1) -> Program:
     """Return one evaluation of the denoiser (``world_model.apply``) for ``batch`` clips.
 
     Of the parameters only paths and shapes are used.
+
+    Raises:
+        UserError: the model has a draft, which a single evaluation would have to be given.
     """
     model = config.model
     clip = model.clip
+    if model.draft.PREDICTS:
+        raise UserError(
+            "One step of a model with a draft (model.draft) cannot be exported alone: export its "
+            "rollout, with --what rollout."
+        )
 
     def like(shape: tuple[int, ...], dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((batch, *shape), dtype)

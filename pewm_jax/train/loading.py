@@ -18,7 +18,7 @@ from pewm_jax import config as configuration
 from pewm_jax import registry as kinds
 from pewm_jax import shipped
 from pewm_jax.config import Config, Settings, UserError
-from pewm_jax.io import weights
+from pewm_jax.io import tree, weights
 from pewm_jax.memory import feature_cache
 from pewm_jax.train import checkpoint_files, processes, runs
 from pewm_jax.types import Params
@@ -137,6 +137,11 @@ def require_weights(config: Config) -> None:
     for stage in runs.all_stages(config):
         if stage.extra_weights is not None and stage.settings(config).steps > 0:
             stage.extra_weights(config.model, config.train)
+    if _drafts(config) and not config.train.start:
+        raise UserError(
+            "model.draft is a network that is not trained: set train.start to the weights that "
+            "training begins with, and train.start_draft to the run that makes drafts."
+        )
     for where, part in _parts(config.model):
         if where in config.model.TRAINS or config.train.start:
             continue
@@ -191,12 +196,30 @@ def encoder(config: Config) -> Params:
 
 
 def _start_weights(config: Config) -> Params:
-    """Return the weights in ``train.start``, from its weights file or else from a checkpoint."""
+    """Return the weights in ``train.start``, and if they have no draft those of ``start_draft``."""
     params = _weights_of(config.train.start)
-    drafted = getattr(config.train, "start_draft", "")
-    if drafted and "draft" not in params:
-        params = {**params, "draft": _weights_of(drafted)}
-    return params
+    if not _drafts(config) or "draft" in params:
+        return params
+    run = config.train.start_draft
+    if not run:
+        raise UserError(
+            f"{config.train.start} has no draft: set train.start_draft to a run whose weights fit "
+            "model.draft, such as small."
+        )
+    found = _weights_of(run)
+    wanted = jax.eval_shape(config.model.init, jax.random.key(0))["draft"]
+    if wrong := tree.mismatches(found, wanted):
+        raise UserError(
+            f"The weights in {run} (train.start_draft) do not fit model.draft "
+            f"({tree.listing(wrong, 2)}): name a run with the same codec, backbone and reader."
+        )
+    return {**params, "draft": found}
+
+
+def _drafts(config: Config) -> bool:
+    """Return whether the model has a draft, by a network that is not trained."""
+    draft = getattr(config.model, "draft", None)
+    return draft is not None and draft.PREDICTS
 
 
 def _weights_of(run: str) -> Params:

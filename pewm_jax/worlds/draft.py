@@ -11,7 +11,8 @@ shows something.
 
 A draft is deterministic: its sampler starts from the same noise in every clip. It always has a
 memory. Where the world is asked for frames without one, that is a memory of the present frame
-alone.
+alone. Errors that training plants into the rendered memory (``train.memory_errors``,
+``train.hidden``) do not change the draft.
 
 Parameters, under ``draft``: those of the first network (``backbone``, ``memory``, ``codec`` …).
 """

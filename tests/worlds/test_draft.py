@@ -14,6 +14,7 @@ from pewm_jax.codecs.pixel import PixelConfig
 from pewm_jax.codecs.signals import as_signal
 from pewm_jax.config import Config, ConfigError, TrainConfig, UserError
 from pewm_jax.config.parts import Draft
+from pewm_jax.convert import stablehlo
 from pewm_jax.diffusion.ddpm import DDPMConfig
 from pewm_jax.diffusion.edm import EDMConfig
 from pewm_jax.io import tree, weights
@@ -292,3 +293,24 @@ def test_a_share_outside_of_0_to_1_is_refused():
 def test_stage_1_is_refused():
     with pytest.raises(UserError, match=r"train\.stage1\.steps is above 0"):
         runs.planned(Config(model=MODEL))
+
+
+def test_training_needs_the_weights_of_a_draft(tmp_path):
+    own, stage = DRAFT.of(MODEL), worlds.stages(MODEL)[2]
+    configuration.save(Config(model=own), tmp_path / "config.json")
+    weights.save(tmp_path / "weights.safetensors", random_world(own), {})
+    with pytest.raises(UserError, match=r"set train\.start .* and train\.start_draft"):
+        loading.require_weights(Config(model=MODEL))
+    train = TrainConfig(start=str(tmp_path))
+    with pytest.raises(UserError, match=r"has no draft: set train\.start_draft"):
+        loading.read_weights(Config(model=MODEL, train=train), stage, print)
+    other = dataclasses.replace(DRAFT, backbone=dataclasses.replace(DRAFT.backbone, layers=2))
+    model = dataclasses.replace(MODEL, draft=other)
+    train = dataclasses.replace(train, start_draft=str(tmp_path))
+    with pytest.raises(UserError, match=r"\(train\.start_draft\) do not fit model\.draft \(back"):
+        loading.read_weights(Config(model=model, train=train), stage, print)
+
+
+def test_one_step_of_a_model_with_a_draft_is_not_exported():
+    with pytest.raises(UserError, match="export its rollout"):
+        stablehlo.denoise_program(Config(model=MODEL), {})
