@@ -95,7 +95,7 @@ class NetworkDraft(Draft):
         return world_model.init(self.of(model), key)
 
 
-def everywhere(
+def predict(
     model: Any, params: Params, observed: Frames, control: Control, readout: MemoryReadout
 ) -> Array:
     """Return a batch's drafts: their latents, and the share of each cell that the memory shows.
@@ -130,7 +130,7 @@ def everywhere(
     return jnp.concatenate([made, world_model.share(model, view.seen_THW)], -1)
 
 
-def lasting(readout: MemoryReadout | None, frames: int) -> MemoryReadout:
+def pad_readout(readout: MemoryReadout | None, frames: int) -> MemoryReadout:
     """Return the readout of a clip whose agent stands still after the frames that were read."""
     assert readout is not None
 
@@ -140,7 +140,7 @@ def lasting(readout: MemoryReadout | None, frames: int) -> MemoryReadout:
     return dataclasses.replace(readout, view=jax.tree.map(longer, readout.view))
 
 
-def gated_view(
+def gate_input(
     model: AssembledModel, params: Params, drafted_BthwC: Array, view: View | None
 ) -> View:
     """Return what the gate blends in: the draft, where the memory shows something."""
@@ -154,8 +154,8 @@ def present_alone(model: AssembledModel, params: Params, frame: Frames) -> Any:
     return memories.from_context(model, params, frame, jnp.ones((1,), bool))
 
 
-def forgetful(model: Any, clip: Clip) -> Clip:
-    """Return a batch in which the share ``draft.alone`` of the clips has the last context frame.
+def drop_context(model: Any, clip: Clip) -> Clip:
+    """Return a batch in which the share ``draft.alone`` of the clips has its last context frame only.
 
     The choice depends on the clips alone.
     """

@@ -39,7 +39,7 @@ def prepare(
     frames = as_signal(clip.frames)
     observed = jax.tree.map(lambda x: x[:, :history], frames)
     if model.draft.PREDICTS:
-        clip = drafts.forgetful(model, clip)
+        clip = drafts.drop_context(model, clip)
     if memory:
         readout = objective.clip_readout(model, params, clip, pictures=True)
     else:
@@ -53,7 +53,7 @@ def prepare(
         noisy = clean + level * jax.random.normal(jax.random.fold_in(key, 2), clean.shape)
         observed = dataclasses.replace(observed, rgb_THWC=noisy)
     if model.draft.PREDICTS:
-        drafted = drafts.everywhere(model, params, observed, control, readout)
+        drafted = drafts.predict(model, params, observed, control, readout)
         more["everywhere_BthwC"] = drafted
     conditioning = world_model.condition(model, params, observed, control, **more)
     shape = (len(frames.depth_THW), *model.latent_shape, model.codec.channels)
@@ -64,7 +64,7 @@ def prepare(
     again = jax.random.fold_in(key, 1)
     latents = world_model.sample(model, params, conditioning, shown, noise, again, blind=blind)
     if model.draft.PREDICTS:
-        blended = drafts.gated_view(model, params, drafted, readout.view)
+        blended = drafts.gate_input(model, params, drafted, readout.view)
         readout = dataclasses.replace(readout, view=blended)
     return clip.without_context().with_extras(
         context_features_ShwF=None, latents_thwC=latents, readout=readout

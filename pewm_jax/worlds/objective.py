@@ -92,13 +92,13 @@ def prepare(
     if model.observed == "warped":
         everywhere = world_model.everywhere(model, params, observed, frames.camera)
     if model.draft.PREDICTS:
-        clip = drafts.forgetful(model, clip)
+        clip = drafts.drop_context(model, clip)
     if memory:
         readout = clip_readout(model, params, clip)
     if model.draft.PREDICTS:
         assert readout is not None, "a draft needs the memory"
         control = Control(frames.camera, clip.actions_TA)
-        everywhere = drafts.everywhere(model, params, observed, control, readout)
+        everywhere = drafts.predict(model, params, observed, control, readout)
     return clip.without_context().with_extras(
         context_features_ShwF=None,
         latents_thwC=rgbd.encode_rgbd(model, params, frames.rgb_THWC, frames.depth_THW),
@@ -570,6 +570,6 @@ def _predict_backwards(
     if view is not None and memories.gated(model):
         arrived: View = jax.tree.map(lambda x: x[:, -1:], view)
         if drafted_BthwC is not None:
-            arrived = drafts.gated_view(model, params, drafted_BthwC[:, -1:], arrived)
+            arrived = drafts.gate_input(model, params, drafted_BthwC[:, -1:], arrived)
         rgb, depth = rgbd.mix(model, params, rgb, depth, arrived)
     return rgb, depth if model.clip.depth else jnp.zeros_like(depth)

@@ -80,7 +80,7 @@ def test_the_first_network_has_the_memory_and_the_control_of_the_model():
 def test_a_draft_is_what_the_first_network_imagines():
     params = random_world(MODEL)
     state = started(params)
-    made = jax.jit(drafts.everywhere, static_argnums=0)
+    made = jax.jit(drafts.predict, static_argnums=0)
     whole = jax.tree.map(lambda a, b: jnp.concatenate([a, b])[None], state.frame.camera, CAMERA)
     shown = world_model.memories.readout(
         MODEL, state.map, jax.tree.map(lambda x: x[0], whole), pictures=True
@@ -229,11 +229,11 @@ def test_a_share_of_the_clips_remembers_the_present_frame_alone():
     valid = np.ones((40, 3), bool)
     valid[:, 2] = False
     clip = dataclasses.replace(clip, context_valid_S=valid)
-    kept = np.asarray(drafts.forgetful(MODEL, clip).context_valid_S)
+    kept = np.asarray(drafts.drop_context(MODEL, clip).context_valid_S)
     assert set(map(tuple, kept)) == {(True, True, False), (False, True, False)}
     assert 8 < (~kept[:, 0]).sum() < 32
     again = np.asarray(
-        drafts.forgetful(MODEL, jax.tree.map(lambda x: x[5:9], clip)).context_valid_S
+        drafts.drop_context(MODEL, jax.tree.map(lambda x: x[5:9], clip)).context_valid_S
     )
     np.testing.assert_array_equal(again, kept[5:9])
 

@@ -88,7 +88,7 @@ def imagine_clip(
     over = None if shared else 0, 0, 0
     rows = np.array([0, shown.stop]) if alone else np.arange(1 + shown.stop)
     if alone and not model.draft.PREDICTS:
-        camera, view = _taken((camera, view), rows)
+        camera, view = _select((camera, view), rows)
     reads = memory and ("memory" in params or model.draft.PREDICTS)
     readout = read_memory(model, remembered, camera, params, view) if reads else None
     if readout is None and model.draft.PREDICTS:
@@ -99,8 +99,8 @@ def imagine_clip(
         model = dataclasses.replace(model, clip=dataclasses.replace(model.clip, frames=2))
         if drafted is not None:
             assert readout is not None
-            camera = _taken(camera, rows)
-            readout, drafted = _alone(readout, drafted, rows)
+            camera = _select(camera, rows)
+            readout, drafted = _select_frames(readout, drafted, rows)
         whole, shown = Control(camera), slice(0, 1)
         control = Control(jax.tree.map(lambda x: x[:, 1:], camera))
     condition = functools.partial(_condition, model, params)
@@ -113,7 +113,7 @@ def imagine_clip(
     if readout is not None and readout.view is not None and memories.gated(model):
         blended = readout.view
         if drafted is not None:
-            blended = drafts.gated_view(model, params, drafted, blended)
+            blended = drafts.gate_input(model, params, drafted, blended)
         remembered_there = jax.tree.map(lambda x: x[:, seen], blended)
         rgb, depth = rgbd.mix(model, params, rgb, depth, remembered_there)
     depth = depth if model.clip.depth else jnp.zeros_like(depth)
@@ -135,14 +135,14 @@ def _decoded(
     return jax.lax.map(decode, latents_KthwC)
 
 
-def _taken(parts: Any, rows: np.ndarray) -> Any:
+def _select(parts: Any, rows: np.ndarray) -> Any:
     """Return some of the (K, T) frames of arrays."""
     return jax.tree.map(lambda x: x[:, rows], parts)
 
 
-def _alone(readout: MemoryReadout, drafted: Array, rows: np.ndarray) -> tuple[Any, Array]:
+def _select_frames(readout: MemoryReadout, drafted: Array, rows: np.ndarray) -> tuple[Any, Array]:
     """Return the readout and the drafts of some of the (K, T) frames; tokens have no frames."""
-    view, encoded, drafted = _taken((readout.view, readout.encoded, drafted), rows)
+    view, encoded, drafted = _select((readout.view, readout.encoded, drafted), rows)
     return dataclasses.replace(readout, view=view, encoded=encoded), drafted
 
 
@@ -151,7 +151,7 @@ def _draft(
 ) -> Array:
     """Return the draft of one candidate, (t, h, w, C + 1)."""
     one = jax.tree.map(lambda x: x[None], (frame, control, readout))
-    return drafts.everywhere(model, params, *one)[0]
+    return drafts.predict(model, params, *one)[0]
 
 
 def _condition(

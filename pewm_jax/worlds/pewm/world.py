@@ -275,8 +275,8 @@ class PEWM(memories.MemoryEdits, AssembledModel):
             shown = memories.readout(self, remembered, camera, params=params, pictures=gated)
             readout = jax.tree.map(lambda x: x[None], shown)
         if self.draft.PREDICTS:
-            shown = drafts.lasting(readout, self.clip.frames)
-            drafted = drafts.everywhere(self, params, observed, whole, shown)[:, : 1 + count]
+            shown = drafts.pad_readout(readout, self.clip.frames)
+            drafted = drafts.predict(self, params, observed, whole, shown)[:, : 1 + count]
         model = self
         if asked:
             model = dataclasses.replace(self, clip=dataclasses.replace(self.clip, frames=1 + asked))
@@ -289,7 +289,7 @@ class PEWM(memories.MemoryEdits, AssembledModel):
         if readout is not None and memories.gated(model):
             view = readout.view
             if drafted is not None:
-                view = drafts.gated_view(model, params, drafted, view)
+                view = drafts.gate_input(model, params, drafted, view)
             rgb, depth = rgbd.mix(model, params, rgb, depth, view)
         depth = depth if self.clip.depth else jnp.zeros_like(depth)
         frames = Frames(rgb[0, 1:], depth[0, 1:], future)
