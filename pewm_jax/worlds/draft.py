@@ -155,7 +155,7 @@ def present_alone(model: AssembledModel, params: Params, frame: Frames) -> Any:
 
 
 def drop_context(model: Any, clip: Clip) -> Clip:
-    """Return a batch in which the share ``draft.alone`` of the clips has its last context frame only.
+    """Return a batch of which the share ``draft.alone`` keeps only its last context frame.
 
     The choice depends on the clips alone.
     """
