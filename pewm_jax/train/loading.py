@@ -134,6 +134,13 @@ def require_weights(config: Config) -> None:
 
     ``train.start`` names those of the model; the loss of a stage may need others.
     """
+    for name in ("start", *(("start_draft",) if _drafts(config) else ())):
+        run = getattr(config.train, name)
+        if run and not _has_weights(shipped.find(run)):
+            raise UserError(
+                f"train.{name} is {run}, which has no weights: name the folder of a trained run, "
+                f"or a model that ships ({', '.join(shipped.names())})."
+            )
     for stage in runs.all_stages(config):
         if stage.extra_weights is not None and stage.settings(config).steps > 0:
             stage.extra_weights(config.model, config.train)
@@ -151,6 +158,11 @@ def require_weights(config: Config) -> None:
                 f"{where} of kind {kinds.of(part).name} needs pretrained weights: "
                 f"{getattr(part, 'WEIGHTS_FROM', convert)} and set train.start to its folder."
             )
+
+
+def _has_weights(run: Path) -> bool:
+    """Return whether a folder is a run with weights or checkpoints, or a checkpoint."""
+    return runs.has_begun(run) or (run / checkpoint_files.WEIGHTS_ITEM).is_dir()
 
 
 def _parts(settings: Settings, prefix: str = "") -> Iterator[tuple[str, Settings]]:

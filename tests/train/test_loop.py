@@ -224,6 +224,13 @@ def test_a_run_folder_that_is_a_file_is_refused(fake_model, tmp_path):
         train(fakes.config(tmp_path / "file"))
 
 
+def test_a_start_without_weights_is_refused_before_the_folder_is_made(fake_model, tmp_path):
+    nowhere, run = tmp_path / "nowhere", tmp_path / "run"
+    with pytest.raises(UserError, match=r"train\.start is .*nowhere, which has no weights"):
+        train(fakes.config(run, start=str(nowhere)))
+    assert not run.exists()
+
+
 def test_nothing_is_compiled_unannounced(fake_model, tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr(loop.LiveView, "log", lambda _view, text: told.append(text))

@@ -306,6 +306,9 @@ def test_training_needs_the_weights_of_a_draft(tmp_path):
         loading.read_weights(Config(model=MODEL, train=train), stage, print)
     other = dataclasses.replace(DRAFT, backbone=dataclasses.replace(DRAFT.backbone, layers=2))
     model = dataclasses.replace(MODEL, draft=other)
+    missing = dataclasses.replace(train, start_draft=str(tmp_path / "nowhere"))
+    with pytest.raises(UserError, match=r"train\.start_draft is .*nowhere, which has no weights"):
+        loading.require_weights(Config(model=MODEL, train=missing))
     train = dataclasses.replace(train, start_draft=str(tmp_path))
     with pytest.raises(UserError, match=r"\(train\.start_draft\) do not fit model\.draft \(back"):
         loading.read_weights(Config(model=model, train=train), stage, print)
