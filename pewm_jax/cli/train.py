@@ -115,7 +115,7 @@ def run(chosen: Chosen, config: Config) -> None:
 
         if isinstance(config.model, World):
             protocols.apply_protocol_file(config, {})  # fail before training
-        folder = loop.runs.check(config)
+        folder = Path(config.train.run)
         runtime.cache_compilation(folder.parent)
         preview = pictures.make_preview(config, folder) if config.train.preview_every else None
         loop.train(config, preview=preview, profile=launch.profile)

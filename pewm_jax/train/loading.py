@@ -132,11 +132,13 @@ def remaining_stages(run: Path, planned: tuple[Stage, ...]) -> tuple[Stage, ...]
 def require_weights(config: Config) -> None:
     """Raise UserError if weights of networks that are never trained are missing.
 
-    ``train.start`` names those of the model; the loss of a stage may need others.
+    ``train.start`` names those of the model; the loss of a stage may need others. A run that has
+    begun no longer needs the folders that it started from.
     """
+    begun = runs.has_begun(Path(config.train.run))
     for name in ("start", *(("start_draft",) if _drafts(config) else ())):
         run = getattr(config.train, name)
-        if run and not _has_weights(shipped.find(run)):
+        if run and not begun and not _has_weights(shipped.find(run)):
             raise UserError(
                 f"train.{name} is {run}, which has no weights: name the folder of a trained run, "
                 f"or a model that ships ({', '.join(shipped.names())})."

@@ -3,6 +3,7 @@
 import itertools
 import json
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -229,6 +230,17 @@ def test_a_start_without_weights_is_refused_before_the_folder_is_made(fake_model
     with pytest.raises(UserError, match=r"train\.start is .*nowhere, which has no weights"):
         train(fakes.config(run, start=str(nowhere)))
     assert not run.exists()
+
+
+def test_a_run_that_has_begun_goes_on_without_the_weights_it_started_from(undisturbed, tmp_path):
+    start, run = tmp_path / "start", tmp_path / "run"
+    shutil.copytree(undisturbed, start)
+    config = fakes.config(run, start=str(start), preview_every=1)
+    with pytest.raises(Interrupted):
+        train(config, preview=StopAt(1, 3))
+    shutil.rmtree(start)
+    train(config)
+    assert runs.is_finished(run, config)
 
 
 def test_nothing_is_compiled_unannounced(fake_model, tmp_path, monkeypatch):
